@@ -11,13 +11,12 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.record import record
-from hbr import DenseIndex, PackedViews, StoppingRule, next_best_view, update_belief
+from hbr import DenseIndex, DenseSession, PackedViews
 from hbr.core.arrays import LevelArray
-from hbr.dense.filter import BETA, completed
 from hbr.descriptors import descriptor
 from hbr.kernels import without_library
 
-KIND = "edges+colours"
+KIND = "edges+colours+cedd"
 VIEWS_OF_AN_OBJECT = 72
 REPEATS = 25
 
@@ -28,12 +27,16 @@ def packed_views(objects: int) -> LevelArray:
     packed = np.empty((objects, VIEWS_OF_AN_OBJECT, descriptor(KIND).size_bytes), np.uint8)
     for start in range(0, objects, 100):
         some = min(100, objects - start)
-        edges, other = (rng.choice(4, (some, 1, 512), p=(0.45, 0.3, 0.17, 0.08)) for _ in range(2))
+        bits = rng.random((2, some, 1, 512)) < 0.25
+        textures = rng.integers(1, 8, (2, some, 1, 144)) * (rng.random((2, some, 1, 144)) < 0.15)
         azimuth = np.arange(VIEWS_OF_AN_OBJECT)[None, :, None] / VIEWS_OF_AN_OBJECT
-        seen = np.where((azimuth - rng.random((some, 1, 512))) % 1.0 < 0.4, other, edges)
+        edges, cedd = (
+            np.where((azimuth - rng.random((some, 1, one.shape[2]))) % 1.0 < 0.4, other, one)
+            for one, other in (bits, textures)
+        )
         colours = 128 + rng.normal(0, 15, (some, 1, 32)) + rng.normal(0, 3, (some, VIEWS_OF_AN_OBJECT, 32))
-        levels = np.concatenate([seen, np.clip(np.rint(colours), 0, 255)], axis=2).astype(np.uint8)
-        rows = descriptor(KIND).pack_rows(levels.reshape(-1, 544))
+        levels = np.concatenate([edges, np.clip(np.rint(colours), 0, 255), cedd], axis=2).astype(np.uint8)
+        rows = descriptor(KIND).pack_rows(levels.reshape(-1, levels.shape[2]))
         packed[start : start + some] = rows.reshape(some, VIEWS_OF_AN_OBJECT, -1)
     return packed.reshape(-1, packed.shape[2])
 
@@ -53,41 +56,30 @@ def bench(objects: int) -> None:
         tuple(f"object {j}" for j in range(objects)),
         KIND,
     )
-    words = packed.view(np.uint64)
+    words = packed.ravel().view(np.uint64)
     peer = "reading the packed views"
     read_ms = milliseconds(words.max)
     first, second = views.levels(np.array([100, 118]))
     index = DenseIndex(views)
-    rule = StoppingRule(BETA, 0.9, np.full((objects, 4), 0.9), (0.1,) * 4, 0.01, 0.02, 0.0, 1)
-    one = update_belief(first, 0.0, index)
-    two = update_belief(second, 90.0, one)
-    kept = len(one.index)
 
-    def step(levels: LevelArray, orientation_deg: float, so_far: object) -> object:
-        belief = update_belief(levels, orientation_deg, so_far)  # type: ignore[arg-type]
-        rule.decide(belief)
-        return next_best_view(belief)
+    def steps(number: int) -> object:
+        """Take the first views of a search, each with its decision and the choice of the next view."""
+        session = DenseSession(index)
+        for levels, orientation_deg in ((first, 0.0), (second, 90.0))[:number]:
+            session.add(levels, orientation_deg)
+            session.next_best_view()
+        return session
 
     name = f"{len(views):,} views"
     record(f"{name}: reading", read_ms, peer, read_ms)
     record(f"{name}: preparing the index", milliseconds(lambda: DenseIndex(views), 3), peer, read_ms)
-    record(
-        f"{name}: belief after the first view", milliseconds(lambda: update_belief(first, 0.0, index)), peer, read_ms
-    )
-    record(
-        f"{name}: first step with decision and next view", milliseconds(lambda: step(first, 0.0, index)), peer, read_ms
-    )
-    record(
-        f"{name}: later step with decision and next view", milliseconds(lambda: step(second, 90.0, one)), peer, read_ms
-    )
-    if kept < objects:
-        check_ms = milliseconds(lambda: completed(two, index), 5)
-        record(f"{name}: last check of the objects left out, two views", check_ms, peer, read_ms)
+    one_ms, both_ms = milliseconds(lambda: steps(1)), milliseconds(lambda: steps(2))
+    record(f"{name}: first step with decision and next view", one_ms, peer, read_ms)
+    record(f"{name}: later step with decision and next view", both_ms - one_ms, peer, read_ms)
     if objects <= 1_000:
         with without_library():
-            plain = DenseIndex(views)
-            numpy_ms = milliseconds(lambda: step(second, 90.0, update_belief(first, 0.0, plain, kept=kept)), 3)
-        both_ms = milliseconds(lambda: step(second, 90.0, update_belief(first, 0.0, index)))
+            index = DenseIndex(views)
+            numpy_ms = milliseconds(lambda: steps(2), 3)
         record(f"{name}: two steps, compiled", both_ms, "the same in NumPy", numpy_ms)
 
 

@@ -23,8 +23,8 @@ from hbr.segmentation import BoxMethod
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.silhouette import guess_object, shares
 
-DESCRIPTORS = ("cedd", "edges+colours")
-DESCRIPTOR = "edges+colours"
+DESCRIPTORS = ("cedd", "edges+colours+cedd")
+DESCRIPTOR = "edges+colours+cedd"
 BENCHES = 6
 VIEWS = 4
 REPEATS = 3
@@ -77,7 +77,7 @@ def one_view(size: tuple[int, int]) -> None:
         "- shrink the frame": (lambda: shrunk(image), 200),
         "- compare it with the empty table": (lambda: table.difference(small), 200),
         "- find, cut out, correct (with both above)": (lambda: segment(image, empty_table=table), 200),
-        "- describe, cedd and edges+colours": (lambda: described(replace(found)), 200),
+        "- describe, cedd and edges+colours+cedd": (lambda: described(replace(found)), 200),
         "whole view, guessed": (lambda: described(segment(image)), 30),
         "- guess": (lambda: guess_object(small), 30),
         "network": (lambda: shares(small, textured=True), 30),

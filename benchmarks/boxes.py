@@ -77,7 +77,7 @@ def real(item: PhotographedObject, masks: Path, step: int) -> Iterator[DrawnFram
 
 
 def enrolled(frames: Iterable[DrawnFrame], empty: NDArray[np.uint8] | None) -> list[tuple[Overlap, str]]:
-    views = ViewsTogether("edges+colours", several=False)
+    views = ViewsTogether("edges+colours+cedd", several=False)
     truths = []
     for frame in frames:
         views.learn(frame.image, empty)
@@ -90,7 +90,7 @@ def enrolled(frames: Iterable[DrawnFrame], empty: NDArray[np.uint8] | None) -> l
 
 def searched(frames: Iterable[DrawnFrame], empty: NDArray[np.uint8] | None) -> Iterator[tuple[Overlap, Overlap]]:
     """Yield the overlap of the newest view by the first segmentation, and by the best one."""
-    views = ViewsTogether("edges+colours")
+    views = ViewsTogether("edges+colours+cedd")
     for frame in frames:
         found = [overlap(one, frame.mask) for one in views.add(frame.image, empty)]
         yield found[0], max(found)

@@ -15,7 +15,7 @@ from rig.evaluation.experiments import load_experiment
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("experiment")
-    parser.add_argument("descriptors", nargs="+", help="Names; several with weights: cedd=0.5,edges+colours=0.5.")
+    parser.add_argument("descriptors", nargs="+", help="Names; several with weights: cedd=0.5,network=0.5.")
     parser.add_argument("--data", type=Path, required=True, help="Images obj{N}__{angle}.png.")
     parser.add_argument("--noise")
     parser.add_argument("--methods", default="hbr,ahbr")

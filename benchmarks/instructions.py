@@ -79,7 +79,7 @@ def _segmented() -> Callable[[int], object]:
     from hbr import Background, descriptor, segment
 
     (image, *_), empty = frames(0)
-    background, kind = Background(empty), descriptor("edges+colours")
+    background, kind = Background(empty), descriptor("edges+colours+cedd")
     return lambda _: kind.describe(segment(image, empty_table=background))
 
 
@@ -89,7 +89,7 @@ def _dense() -> Callable[[int], object]:
     from hbr import DenseIndex, next_best_view, update_belief
     from hbr.dense.filter import Belief
 
-    views = of_kind(model(OBJECTS), "edges+colours")
+    views = of_kind(model(OBJECTS), "edges+colours+cedd")
     belief: DenseIndex | Belief = DenseIndex(views)
     for row in SEEN:
         belief = update_belief(views.descriptors[row], float(views.azimuth_deg[row]), belief)
@@ -104,7 +104,7 @@ def _dense() -> Callable[[int], object]:
 PARTS: Final[dict[str, Callable[[], Callable[[int], object]]]] = {
     "CEDD of a frame, 640 x 480": _cedd,
     "HBR and AHBR, 8th view of 7,200": _ahbr,
-    "object found, described by edges+colours": _segmented,
+    "object found, described by edges+colours+cedd": _segmented,
     "dense filter and next best view, 8th view of 7,200": _dense,
 }
 

@@ -1,12 +1,10 @@
 """Retrieval: arrays in, decisions out."""
 
 from hbr.dense.filter import Belief, update_belief
-from hbr.dense.fitting import FittedRule, fit_stopping_rule, rule_from_searches
 from hbr.dense.index import DenseIndex
-from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
+from hbr.dense.stopping import Outcome, StopDecision, StopReason
 from hbr.descriptors import Descriptor, descriptor
 from hbr.descriptors.cedd import cedd, pack, unpack, unpack_rows
 from hbr.descriptors.registry import describe
@@ -27,8 +25,6 @@ __all__ = [
     "DenseSession",
     "Descriptor",
     "Extension",
-    "FittedRule",
-    "LeaveOneOut",
     "NextBestView",
     "Outcome",
     "PackedViews",
@@ -37,22 +33,18 @@ __all__ = [
     "Side",
     "StopDecision",
     "StopReason",
-    "StoppingRule",
     "ViewIndex",
     "Views",
     "ViewsTogether",
     "cedd",
     "describe",
     "descriptor",
-    "fit_stopping_rule",
     "hypotheses",
-    "leave_one_out",
     "next_best_view",
     "next_view",
     "open_set_threshold",
     "pack",
     "retrieve",
-    "rule_from_searches",
     "score_margin",
     "segment",
     "tanimoto",

@@ -23,18 +23,19 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from hbr.dense.filter import Belief
-from hbr.dense.index import BINS, Floats
+from hbr.dense.filter import BETA, Belief
+from hbr.dense.index import BINS
+from hbr.dense.space import Floats
 
-#: Support per view of the best hypothesis from which the object before is known, and the evidence that is needed then.
+#: Score of the best object from which the object before is known, and the evidence that is needed then.
 # with a lower support or less evidence, unknown objects begin again more often
-KNOWN_FROM: Final = 0.75
-CHANGED_FROM_KNOWN: Final = 3.0
-CHANGED_FROM: Final = 7.0
+KNOWN_FROM: Final = 0.65
+CHANGED_FROM_KNOWN: Final = 2.0
+CHANGED_FROM: Final = 6.0
 #: So much more evidence is needed for each further view before, because their misfits to the enrolled views add up.
-MORE_PER_VIEW: Final = 2.0
+MORE_PER_VIEW: Final = 1.0
 #: So much less evidence is needed if the table moved without a command before the view.
-DISTURBED: Final = 3.0  # more: more changes are noticed at once, and more searches begin again wrongly
+DISTURBED: Final = 2.0  # more: more changes are noticed at once, and more searches begin again wrongly
 #: The mean is over at least this number of objects.
 _LEAST_OBJECTS: Final = 100
 
@@ -51,7 +52,7 @@ class Change(NamedTuple):
     needed: float
 
 
-def changed(belief: Belief, before: Iterable[Belief], *, beta: float, disturbed: Collection[int] = ()) -> Change | None:
+def changed(belief: Belief, before: Iterable[Belief], *, disturbed: Collection[int] = ()) -> Change | None:
     """Return the likeliest change, or None if the views show one object.
 
     Parameters
@@ -60,19 +61,17 @@ def changed(belief: Belief, before: Iterable[Belief], *, beta: float, disturbed:
         After all views.
     before : iterable of Belief
         Earlier beliefs of the same search, after each of which the object may have changed.
-    beta : float
-        As for `Belief.posterior`.
     disturbed : collection of int
         The views, from 0, before which the table moved without a command.
     """
     found: list[Change] = []
     objects = max(len(belief.index.views.object_names), _LEAST_OBJECTS)
-    of_all = _log_sum(belief.support, beta)
+    of_all = _log_sum(belief.support)
     for one in before:
         if one.index is not belief.index:  # an object was added that the first view had left out
             continue
-        apart = _log_sum(one.support, beta) + _log_sum(belief.support - one.support, beta)
-        known = float(one.support.max()) / one.amount >= KNOWN_FROM
+        apart = _log_sum(one.support) + _log_sum(belief.support - one.support)
+        known = float(one.scores().max()) >= KNOWN_FROM
         needed = (CHANGED_FROM_KNOWN if known else CHANGED_FROM) + MORE_PER_VIEW * (one.amount - 1)
         if one.queries in disturbed:
             needed -= DISTURBED
@@ -82,7 +81,7 @@ def changed(belief: Belief, before: Iterable[Belief], *, beta: float, disturbed:
     return max(found, key=lambda change: change.evidence, default=None)
 
 
-def _log_sum(support: Floats, beta: float) -> float:
-    exponents = beta * support.astype(np.float64)
+def _log_sum(support: Floats) -> float:
+    exponents = BETA * support.astype(np.float64)
     most = float(exponents.max())
     return most + log(float(np.exp(exponents - most).sum()))

@@ -45,8 +45,6 @@ MIN_WEIGHT: Final = 2000.0
 MAX_UNEXPLAINED: Final = 0.5  # with more, a third object explains the view as well as the leader does
 # larger: an unknown object that resembles one twin is found; smaller: a noisy camera never decides
 MAX_MISFIT: Final = 2.0
-#: Two objects whose enrolled views differ by less, in grey levels of a pixel, are near twins.
-TWINS_APART: Final = 20.0
 #: Largest displacement of a detail after the registration, by parallax and by views between two enrolled ones.
 _REACH_PX: Final = 3  # larger: a small sticker matches a shade beside it; smaller: parallax looks like a difference
 #: Differences of grey levels that noise and sharpness explain.
@@ -158,11 +156,6 @@ class LocalDecision:
     def fits(self) -> bool:
         """Whether the better object explains the views up to noise."""
         return self.misfit <= MAX_MISFIT
-
-    @property
-    def twins(self) -> bool:
-        """Whether the two objects look the same apart from a detail."""
-        return self.apart <= TWINS_APART
 
 
 class _Fit(NamedTuple):
@@ -403,6 +396,22 @@ class Pixels:
             alone[~inside] = alone[inside].mean()
         half = cv2.resize(alone, (FIT_PX // 2, FIT_PX // 2), interpolation=cv2.INTER_AREA)
         return cls(colours.astype(np.float32), mask, np.asarray(half, np.float32))
+
+
+class PixelFit(NamedTuple):
+    """The fit of a leader to the views of a search, at most 1.
+
+    Attributes
+    ----------
+    own, others : float
+        Mean fit of the leader and of the next candidates.
+    expected : float
+        Mean fit of the two enrolled views of the leader beside each view to each other.
+    """
+
+    own: float
+    others: float
+    expected: float
 
 
 def fit(view: Pixels, enrolled: Pixels) -> float:

@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike
 
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.dense.filter import BETA, Belief
+from hbr.dense.filter import Belief
 from hbr.dense.index import BINS
-from hbr.descriptors import Packed
 
 #: λ: how reliably a view separates two objects that look different.
 # chosen together with `_NEAR_DEG` and the cost of a second; no rate changes much with them (decision 0014)
-SHARPNESS: Final = 100.0
+SHARPNESS: Final = 50.0
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.
 # 60, or one for each peak, are worse: the bins of one arc represent what is unknown (decision 0014)
 _STRONGEST: Final = 16
@@ -62,7 +61,6 @@ class NextBestView:
 def next_best_view(
     belief: Belief,
     *,
-    beta: float = BETA,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
 ) -> NextBestView:
@@ -78,8 +76,6 @@ def next_best_view(
     ----------
     belief : Belief
         After at least one query.
-    beta : float
-        As for `Belief.posterior`.
     rotations_deg : array (a,), optional
         Possible rotations, e.g. within the cable budget; by default every 5 degrees, the shorter way round.
     seconds : array (a,), optional
@@ -110,7 +106,7 @@ def next_best_view(
     landing_deg = here_deg + angles_deg
     apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
-    pairs = pairs_after(belief, beta, angles_deg)
+    pairs = pairs_after(belief, angles_deg)
     is_one = not len(pairs.probability)  # one object alone: a new side helps to find its azimuth
     if is_one:
         confusion = -SHARPNESS * novelty
@@ -153,19 +149,15 @@ class Pairs(NamedTuple):
         return int(self.objects[0, place]), int(self.objects[1, place])
 
 
-def pairs_after(belief: Belief, beta: float, rotations_deg: FloatArray) -> Pairs:
+def pairs_after(belief: Belief, rotations_deg: FloatArray) -> Pairs:
     """Return the pairs of strong hypotheses, after each of some rotations, float64 (a,)."""
-    probability, place, bin_of = strongest(belief.posterior(beta))
+    probability, place, bin_of = strongest(belief.posterior())
     first, second = _all_pairs(len(place))
     different = place[first] != place[second]
     first, second = first[different], second[different]
-    compared = belief.index.compared
     rows, away_deg = expected_views(belief, place, bin_of, rotations_deg)
     known = np.exp(-0.5 * (away_deg / _NEAR_DEG) ** 2)
-    if isinstance(compared, Packed):
-        similar = compared.pairs(rows, first, second)
-    else:
-        similar = compared.among(rows)[:, first, second]
+    similar = belief.index.among(rows)[:, first, second]
     return Pairs(
         belief.index.object_index[place[np.stack([first, second])]],
         probability[first] * probability[second],

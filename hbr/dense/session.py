@@ -1,14 +1,13 @@
 """One search by the dense filter: views in; belief, decision and next best view out. It reads no image itself.
 
-When it ends, it takes two last steps, which compare its views with enrolled ones, pixel by pixel. It asks for enrolled
-views (`NeedEnrolledViews`); its driver brings them. `DenseSession.end` is the decision after the steps:
+Two steps compare its views with enrolled ones, pixel by pixel. They ask for enrolled views (`NeedEnrolledViews`); the
+driver of the search brings them:
 
-- `verify`, for a doubtful leader. The open-set score compares descriptors of 8 x 8 cells. An unknown object may
-  resemble an enrolled one at this coarse scale, although its details do not fit. For each view, the enrolled views at
-  the estimated pose are registered to it. The fit is the share of the view's contrast that they explain, in colours
-  that light hardly changes. The fit of the leader, and its difference from the fit of the next candidates, are added to
-  the open-set score with weights.
-- `compare_leaders`, for the two leaders of a search that does not end with one object.
+- `DenseSession.verify`, after each view at rest. The evidence compares descriptors of 8 x 8 cells. An object that is
+  not enrolled may resemble an enrolled one at this coarse scale, although its details do not fit. For each view, the
+  enrolled views at the estimated pose are registered to it. The fit is the share of its contrast that they explain, in
+  colours that light hardly changes. It is a part of the posterior (`hbr.dense.stopping`).
+- `DenseSession.compare`, for the two leaders of a search that does not end with one object.
 
 The comparisons themselves are in `hbr.dense.local_difference`.
 
@@ -20,7 +19,6 @@ Decisions: docs/decisions/0013, docs/decisions/0016, docs/decisions/0015, docs/d
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -29,34 +27,30 @@ from numpy.typing import ArrayLike
 from hbr.core.angles import size_deg, wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.change import Change, changed
-from hbr.dense.filter import KEPT, Belief, completed, update_belief
+from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.local_difference import NEAREST, LocalDecision, LocalView, Pixels, chosen_views, compare_objects, fit
+from hbr.dense.local_difference import (
+    NEAREST,
+    LocalDecision,
+    LocalView,
+    PixelFit,
+    Pixels,
+    chosen_views,
+    compare_objects,
+    fit,
+)
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.pose import poses_of
-from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason, fitted_before
-from hbr.descriptors import descriptor
-from hbr.descriptors.together import like_enrollment
+from hbr.dense.stopping import ERROR_RATE, Outcome, StopDecision, StopReason, decide, posterior
 
-#: Numbers of compared candidates beside the leader, and of segmentations of each view.
-_OTHERS: Final = 3  # more: a surer lead; each needs the enrolled images of one more object
-_SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of every candidate
-#: Weights of the open-set score, of the leader's fit, and of its difference from that of other candidates; an offset.
-#: Fitted like `hbr.dense.stopping.fitted_before`: the result is a log-odds.
-_WEIGHTS: Final = (0.714, 9.438, 4.995)
-_OFFSET: Final = -5.416
-#: Log-odds from which an object is found, and below which it is unknown: that of 1 in 100 enrolled objects.
-FOUND_FROM: Final = 0.0
-#: Log-odds from which an object is found where the bench may be that of the enrollment: there an enrolled object fits
-#: much better. In searches for objects 1–50 after a mild change, enrolled ones reach 5.6 or more, others 1.1 or less.
-FOUND_FROM_SAME_BENCH: Final = 3.0
-UNKNOWN_BELOW: Final = -1.3
-#: With a smaller open-set score, an object is unknown at any fit.
-_HOPELESS: Final = -7.0
+#: Segmentations of each view that are compared.
+_SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of both candidates
+#: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search;
+#: and after the last view, no fit changes the answer.
+_NOT_WORTH_A_FIT: Final = 0.95
+_HOPELESS: Final = 0.998
 #: Share of the probability that the two leaders have together.
 LEADERS: Final = 0.9  # with less, a third object is likely, and a difference of two decides nothing
-#: Near twins score nearly the same: with a larger margin, an unknown object is not compared with the two leaders.
-TWIN_MARGIN: Final = 0.02
 
 _Result = TypeVar("_Result")
 
@@ -102,81 +96,69 @@ def near(own_deg: ArrayLike, azimuths_deg: Sequence[float]) -> IndexArray:
     return places
 
 
-@dataclass(frozen=True)
-class Verification:
-    """Fit of the leader's enrolled views to the views of a search.
-
-    Attributes
-    ----------
-    object_index : int
-        The leader.
-    fit, others : float
-        Mean fit of the leader and of the next candidates over the views, at most 1.
-    """
+class Verification(NamedTuple):
+    """The fit of the leader's enrolled views to the views of a search; the leader is an index of the views' names."""
 
     object_index: int
-    fit: float
-    others: float
-
-    def score(self, open_set_score: float) -> float:
-        """Return the log-odds that the leader is the object on the table, from the fits and the open-set score."""
-        numbers = (open_set_score, self.fit, self.fit - self.others)
-        return sum(weight * number for weight, number in zip(_WEIGHTS, numbers, strict=True)) + _OFFSET
-
-    def decided(self, decision: StopDecision, least: float = FOUND_FROM) -> StopDecision:
-        """Return the decision that replaces the given one; log-odds of at least ``least`` find the object."""
-        score = self.score(decision.open_set_score)
-        outcome = Outcome.UNKNOWN if score < UNKNOWN_BELOW else Outcome.AMBIGUOUS
-        if score >= least and decision.probability >= decision.min_confidence:
-            outcome = Outcome.FOUND
-        return replace(decision, outcome=outcome, reason=StopReason.PIXEL_FIT)
+    fit: PixelFit
 
 
-def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: str) -> bool:
-    """Return whether a search must verify its leader before it ends.
+class _Fits:
+    """The fits of a search; each is measured once."""
 
-    This is so if the open-set score of the decision with which it would end is too low for an answer after fewer views.
-    The weights are for the scores that come with the program for a descriptor, the ``kind``. The rule has them if the
-    catalog has enough objects.
+    def __init__(self) -> None:
+        self._seen: dict[int, list[Pixels]] = {}
+        self._enrolled: dict[tuple[int, float], Pixels] = {}
+        self._of_views: dict[tuple[int, int, float], float] = {}
+        self._of_pairs: dict[tuple[int, float, float], float] = {}
+
+    def of_view(self, n: int, queries: Queries, object_index: int, enrolled: LocalView) -> float:
+        """Return the fit of an enrolled view to the view n of the search, by its better segmentation."""
+        key = n, object_index, enrolled.azimuth_deg
+        if key not in self._of_views:
+            if n not in self._seen:
+                self._seen[n] = [Pixels.of(one) for one in queries(n)[:_SEGMENTATIONS]]
+            pixels = self._pixels(object_index, enrolled)
+            self._of_views[key] = max(fit(one, pixels) for one in self._seen[n])
+        return self._of_views[key]
+
+    def of_pair(self, object_index: int, one: LocalView, other: LocalView) -> float:
+        """Return the fit of two enrolled views of an object."""
+        key = object_index, one.azimuth_deg, other.azimuth_deg
+        if key not in self._of_pairs:
+            self._of_pairs[key] = fit(self._pixels(object_index, one), self._pixels(object_index, other))
+        return self._of_pairs[key]
+
+    def _pixels(self, object_index: int, view: LocalView) -> Pixels:
+        key = object_index, view.azimuth_deg
+        if key not in self._enrolled:
+            self._enrolled[key] = Pixels.of(view)
+        return self._enrolled[key]
+
+
+def verify(belief: Belief, queries: Queries, fits: _Fits | None = None) -> Asking[Verification | None]:
+    """Compare the views of a search with the enrolled views of its two leading candidates; None without such views.
+
+    The queries are in the order of the belief's.
     """
-    fitted = len(rule.open_set_thresholds)
-    model = fitted_before(kind, fitted)
-    if model is None or rule.open_set is None or not np.array_equal(model.weights, rule.open_set.weights):
-        return False
-    if decision.outcome is Outcome.CONTINUE or views < fitted or decision.reason is StopReason.UNCHANGED_BENCH:
-        return False
-    return _HOPELESS < decision.open_set_score < max(rule.open_set_thresholds)
-
-
-def verify(belief: Belief, leader: int, queries: Queries) -> Asking[Verification | None]:
-    """Compare the views of a search with the enrolled views of its leader and of the next candidates; None without.
-
-    The leader is an index of the views' names, and the queries are in the order of the belief's levels.
-    """
-    index, last_deg = belief.index, float(belief.orientation_deg[-1])
-    candidates = [leader, *[one for one in belief.ranking().object_index.tolist() if one != leader][:_OTHERS]]
-    seen: list[list[Pixels]] = []
-    similarity = descriptor(index.views.descriptor).similarity
-    means = []
-    for candidate in candidates:
+    fits = fits or _Fits()
+    last_deg = float(belief.orientation_deg[-1])
+    order = np.argsort(-belief.probability(), kind="stable")[:2]
+    means, expected = [], 0.0
+    for candidate in belief.index.object_index[order].tolist():
         pose_deg, *_ = poses_of(belief, candidate)
         azimuths_deg = [wrap360(pose_deg + o - last_deg) for o in belief.orientation_deg.tolist()]
         views = yield NeedEnrolledViews(candidate, tuple(azimuths_deg))
-        if views is None:
+        if not views:
             return None
-        seen = seen or [[Pixels.of(one) for one in queries(n)] for n in range(belief.queries)]
         enrolled_deg = np.array([view.azimuth_deg for view in views])
-        nearest = [_nearest(enrolled_deg, azimuth_deg).tolist() for azimuth_deg in azimuths_deg]
-        prepared = {place: Pixels.of(views[place]) for place in set(chain(*nearest))}
-        rows = index.views.of(candidate)
-        fits = []
-        for n, azimuth_deg in enumerate(azimuths_deg):
-            own = rows[_nearest(index.views.azimuth_deg[rows], azimuth_deg)]
-            alike: FloatArray = similarity(np.atleast_2d(belief.levels[n]), index.views.levels(own)).max(axis=1)
-            likeliest = np.argsort(-alike, kind="stable")[:_SEGMENTATIONS].tolist()
-            fits.append(max(fit(seen[n][one], prepared[place]) for one in likeliest for place in nearest[n]))
-        means.append(float(np.mean(fits)))
-    return Verification(leader, means[0], float(np.mean(means[1:])) if len(means) > 1 else 0.0)
+        nearest = [[views[place] for place in _nearest(enrolled_deg, deg).tolist()] for deg in azimuths_deg]
+        best = [max(fits.of_view(n, queries, candidate, one) for one in near) for n, near in enumerate(nearest)]
+        means.append(float(np.mean(best)))
+        if len(means) == 1:  # what a view between two enrolled ones has at least
+            expected = float(np.mean([fits.of_pair(candidate, near[0], near[-1]) for near in nearest]))
+    leader = int(belief.index.object_index[order[0]])
+    return Verification(leader, PixelFit(means[0], means[1] if len(means) > 1 else 0.0, expected))
 
 
 def _nearest(own_deg: FloatArray, azimuth_deg: float) -> IndexArray:
@@ -198,8 +180,6 @@ class LeaderComparison:
         The enrolled views of both leaders.
     found : LocalDecision
         What the comparison found.
-    outcome : Outcome
-        Outcome of the search after the comparison.
     winner : int or None
         The leader that was found, as an index of the views' names; None if the comparison names none.
     max_error : float
@@ -210,15 +190,13 @@ class LeaderComparison:
     compared: tuple[int, ...]
     views: tuple[Sequence[LocalView], Sequence[LocalView]]
     found: LocalDecision
-    outcome: Outcome
     winner: int | None
     max_error: float
 
     def decided(self, decision: StopDecision) -> StopDecision:
         """Return the decision that replaces the given one; its probability is that of the comparison."""
         if self.winner is None:
-            changed = self.outcome is not decision.outcome
-            return replace(decision, outcome=self.outcome, reason=StopReason.LOCAL_DIFFERENCE) if changed else decision
+            return decision
         return replace(
             decision,
             outcome=Outcome.FOUND,
@@ -230,19 +208,16 @@ class LeaderComparison:
 
 
 def compare_leaders(
-    belief: Belief, outcome: Outcome, queries: Queries, *, beta: float, max_error: float
+    belief: Belief, outcome: Outcome, queries: Queries, *, max_error: float = ERROR_RATE
 ) -> Asking[LeaderComparison | None]:
-    """Compare the two leaders of a search that is ambiguous, or that calls near twins unknown; None if it has no two.
+    """Compare the two leaders of a search that is ambiguous; None if it has no two.
 
-    If two near twins are enrolled, the leading one has a small margin, and the open-set score is low. Therefore an
-    object that fits one of them up to noise is not unknown. ``outcome`` is that with which the search would end, and
-    ``max_error`` the largest probability that a decision is wrong.
+    ``outcome`` is that with which the search would end, and ``max_error`` the largest probability that a decision is
+    wrong.
     """
-    if outcome not in (Outcome.AMBIGUOUS, Outcome.UNKNOWN):
+    if outcome is not Outcome.AMBIGUOUS:
         return None
-    probability = belief.probability(beta)
-    if outcome is Outcome.UNKNOWN and _margin(belief.scores(), probability) > TWIN_MARGIN:
-        return None
+    probability = belief.probability()
     order = np.argsort(-probability, kind="stable")[:2]
     if len(order) < 2 or float(probability[order].sum()) < LEADERS:
         return None
@@ -262,21 +237,14 @@ def compare_leaders(
     both = enrolled[0], enrolled[1]
     likeliest = [queries(n)[0] for n in compared]
     found = compare_objects(likeliest, both, (rotations_deg[0], rotations_deg[1]), max_error=max_error)
-    winner = None
-    if outcome is Outcome.AMBIGUOUS or (found.fits and found.twins):
-        winner = None if found.winner is None else (first, second)[found.winner]
-        outcome = Outcome.AMBIGUOUS if winner is None else Outcome.FOUND
-    return LeaderComparison((first, second), tuple(compared), both, found, outcome, winner, max_error)
-
-
-def _margin(scores: FloatArray, probability: FloatArray) -> float:
-    """Return by how much the score of the likeliest object exceeds all others."""
-    best = int(np.lexsort((-scores, -probability))[0])
-    return float(scores[best] - np.delete(scores, best).max(initial=0.0))
+    winner = None if found.winner is None else (first, second)[found.winner]
+    return LeaderComparison((first, second), tuple(compared), both, found, winner, max_error)
 
 
 #: Number of times that a search begins again because the object changed.
 MOST_CHANGES: Final = 3  # more: a hand that stays in the picture holds up the bench; fewer: it uses up all of them
+#: Number of objects of a large catalog that are considered.
+KEPT: Final = 500  # more: each view takes longer, and more memory; fewer: the object is missed more often
 _WORTH_REDUCING: Final = 2  # of a smaller catalog, a reduced index saves less time than its making takes
 
 
@@ -287,8 +255,6 @@ class DenseSession:
     ----------
     index : DenseIndex
         The enrolled views.
-    rule : StoppingRule
-        Decides when the search ends.
     max_views : int
         Views after which it ends in any case, counted from the last change of the object.
     most_changes : int
@@ -303,13 +269,13 @@ class DenseSession:
     change : Change, optional
         The change that the last view showed.
     decision : StopDecision
-        The rule's last decision: at rest, after the last view.
+        The last decision: at rest, after the last view.
     present : StopDecision
-        What the rule would decide after the last view, if it decided after each one.
+        What the decision would be after the last view, if there was one after each.
     is_new_decision : bool
         Whether the last view led to a decision.
     verification : Verification, optional
-        The verification of the leader after the last view, if there was one.
+        The fit of the leader after the last view, if it was measured.
     comparison : LeaderComparison, optional
         The comparison of the two leaders after the last view, if there was one.
     """
@@ -325,21 +291,18 @@ class DenseSession:
     _NEWEST: ClassVar[int] = 2
     """Number of decisions since which the object may have changed."""
 
-    def __init__(
-        self, index: DenseIndex, rule: StoppingRule, *, max_views: int = 8, most_changes: int = MOST_CHANGES
-    ) -> None:
-        self.rule = rule
+    def __init__(self, index: DenseIndex, *, max_views: int = 8, most_changes: int = MOST_CHANGES) -> None:
         self.max_views = max_views
         self._changes_left = most_changes
-        # If a search ends after one or two views, an index of a part of the views costs more time than it saves.
-        self._kept = KEPT if len(index) > _WORTH_REDUCING * KEPT else len(index)
+        self._all = index
         self._index = index
+        self._closest: FloatArray | None = None
         self._so_far: DenseIndex | Belief = index
         self._before: deque[Belief] = deque(maxlen=self._NEWEST)
+        self._queries: list[LevelArray] = []
         self._disturbed: set[int] = set()
-        self._reliable = True
-        self._same_bench: bool | None = None
-        self._like_enrollment: bool | None = None
+        self._reliable, self._other_bench = True, False
+        self._fits = _Fits()
 
     def add(
         self,
@@ -348,11 +311,10 @@ class DenseSession:
         *,
         earlier: Sequence[LevelArray] | None = None,
         reliable: bool = True,
-        same_bench: bool | None = None,
-        segmented_by: str | None = None,
+        other_bench: bool = False,
         disturbed: bool = False,
     ) -> StopDecision:
-        """Add the next view, as for `update_belief`, and return the rule's last decision.
+        """Add the next view, as for `update_belief`, and return the last decision.
 
         Parameters
         ----------
@@ -365,16 +327,12 @@ class DenseSession:
         reliable : bool
             Whether the views were segmented reliably (`hbr.ViewsTogether.reliable`). If not, the search does not end
             while it may take more views.
-        same_bench : bool, optional
-            Whether the bench is that of the enrollment; None: not known.
-        segmented_by : str, optional
-            The `hbr.segmentation.Method` of the view. The rule considers the bench only with a method that segments
-            like the enrollment (`hbr.descriptors.together.like_enrollment`).
+        other_bench : bool
+            Whether the bench is certainly not that of the enrollment (`hbr.Background.shows_another_bench`).
         disturbed : bool
             Whether the table moved without a command since the view before, as if by hand.
         """
-        self._reliable, self._same_bench = reliable, same_bench
-        self._like_enrollment = same_bench if segmented_by is None else like_enrollment(segmented_by, same_bench)
+        self._reliable, self._other_bench = reliable, other_bench
         self.verification = self.comparison = None  # they were for the views before
         if earlier is not None:
             self._replace(earlier)
@@ -386,20 +344,17 @@ class DenseSession:
         self.present = self._decide()
         if self.is_new_decision:
             self.decision = self.present
-            if self.decision.outcome is not Outcome.CONTINUE:
-                self._complete()
-            self.present = self.decision
         return self.decision
 
     def _changed(self) -> Change | None:
         """Begin again with the newest views if they show another object."""
         if not (self._changes_left and self.is_new_decision):
             return None
-        found = changed(self.belief, self._before, beta=self.rule.beta, disturbed=self._disturbed)
+        found = changed(self.belief, self._before, disturbed=self._disturbed)
         if found is None:
             return None
         self._changes_left -= 1
-        newest = self.belief.levels[found.first :], self.belief.orientation_deg[found.first :].tolist()
+        newest = self._queries[found.first :], self.belief.orientation_deg[found.first :].tolist()
         found = found._replace(first=self.left_out + found.first)
         self.left_out = found.first
         self._forget()
@@ -411,7 +366,8 @@ class DenseSession:
 
     def _forget(self) -> None:
         """Forget all views."""
-        self._so_far = self._index
+        self._so_far, self._index, self._closest = self._all, self._all, None
+        self._queries, self._fits = [], _Fits()
         self._before.clear()
         self._disturbed.clear()
 
@@ -422,69 +378,92 @@ class DenseSession:
         """Add a view to the belief."""
         if self.is_new_decision and isinstance(self._so_far, Belief):
             self._before.append(self._so_far)
-        self._so_far = self.belief = update_belief(
-            levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
-        )
+        weight = self._weight(orientation_deg)
+        self._queries.append(levels)
+        if self._shortlisted(levels):
+            self._begin_again()
+        self._so_far = self.belief = update_belief(levels, orientation_deg, self._so_far, weight=weight)
+
+    def _shortlisted(self, levels: LevelArray) -> bool:
+        """Choose the objects of a large catalog that are considered; return whether there are new ones.
+
+        They are the ones with the most similar views to all queries so far, compared without the space.
+        """
+        if len(self._all) <= _WORTH_REDUCING * KEPT:
+            return False
+        closest = self._all.closest(levels)
+        self._closest = closest if self._closest is None else self._closest + closest
+        places = np.sort(np.argsort(-self._closest, kind="stable")[:KEPT])
+        chosen = self._all.object_index[places]
+        if self._index is not self._all and np.isin(chosen, self._index.object_index).all():
+            return False
+        self._index = self._all.only(places, None if self._index is self._all else self._index)
+        return True
+
+    def _begin_again(self) -> None:
+        """Compute the belief of all earlier queries again, for the objects that are now considered."""
+        earlier = self._so_far if isinstance(self._so_far, Belief) else None
+        self._so_far = self._index
+        self._before.clear()
+        if earlier is None:
+            return
+        weights = [None] * earlier.queries if earlier.weights is None else earlier.weights.tolist()
+        for query, deg, weight in zip(self._queries, earlier.orientation_deg.tolist(), weights, strict=False):
+            self._so_far = update_belief(query, deg, self._so_far, weight=weight)
 
     def _replace(self, queries: Sequence[LevelArray]) -> None:
         """Compute the belief again from other descriptions of the same views."""
-        before = self._so_far.levels if isinstance(self._so_far, Belief) else ()
-        if len(queries) != self.left_out + len(before):
-            raise ValueError(f"{len(queries)} earlier views; the search has {self.left_out + len(before)}")
+        if len(queries) != self.left_out + len(self._queries):
+            raise ValueError(f"{len(queries)} earlier views; the search has {self.left_out + len(self._queries)}")
         queries = queries[self.left_out :]
-        if all(np.array_equal(a, b) for a, b in zip(queries, before, strict=True)):
+        if all(np.array_equal(a, b) for a, b in zip(queries, self._queries, strict=True)):
             return
         orientations_deg = self.belief.orientation_deg.tolist()
-        self._so_far = self._index
-        self._before.clear()
+        disturbed = set(self._disturbed)
+        self._forget()
+        self._disturbed |= disturbed
         for query, orientation_deg in zip(queries, orientations_deg, strict=True):
             self._extend(query, orientation_deg)
 
     def next_best_view(self, rotations_deg: ArrayLike | None = None, seconds: ArrayLike | None = None) -> NextBestView:
         """Return the rotation to the next best view, as `hbr.next_best_view` does."""
-        return next_best_view(self.belief, beta=self.rule.beta, rotations_deg=rotations_deg, seconds=seconds)
+        return next_best_view(self.belief, rotations_deg=rotations_deg, seconds=seconds)
 
     def end(self) -> StopDecision:
-        """Return the decision with which the search ends here, even if the rule would continue.
+        """Return the decision with which the search ends here, even if it would continue.
 
-        The last steps that were taken after the last view count.
+        The steps that were taken after the last view count.
         """
         decision = self.decision
         if decision.outcome is Outcome.CONTINUE:
-            self._complete()
             decision = self._decide(last=True)
-        if self.verification is not None:
-            decision = self.verification.decided(decision, self.found_from)
         return decision if self.comparison is None else self.comparison.decided(decision)
 
-    @property
-    def found_from(self) -> float:
-        """Log-odds from which a verified leader is found."""
-        return FOUND_FROM if self._same_bench is False else FOUND_FROM_SAME_BENCH
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether the search must verify its leader before it ends (`hbr.dense.session.is_doubtful`)."""
-        return is_doubtful(self.rule, self.end(), self.belief.queries, self.belief.index.views.descriptor)
-
     def verify(self, queries: Queries, measured: Verification | None = None) -> Asking[Verification | None]:
-        """Verify a doubtful leader, pixel by pixel; None without doubt.
+        """Compare the leader with the views pixel by pixel, and decide again; None if that is not worth its time.
 
         A fit that was ``measured`` before is used instead of enrolled views.
         """
-        self.verification = None
-        if measured is None and self.is_doubtful:
-            measured = yield from verify(self.belief, self.end().object_index, queries)
+        if measured is None and self._is_worth_a_fit():
+            measured = yield from verify(self.belief, queries, self._fits)
         self.verification = measured
+        if measured is not None:
+            self.decision = self.present = self._decide()
         return measured
+
+    def posterior(self) -> tuple[FloatArray, float]:
+        """Return the probability of each object considered, and that the object is not enrolled."""
+        fit = None if self.verification is None else self.verification.fit
+        return posterior(self.belief, fit, other_bench=self._other_bench)
+
+    def _is_worth_a_fit(self) -> bool:
+        last = self.belief.queries >= self.max_views
+        return (last or self._reliable) and self.decision.not_enrolled < (_HOPELESS if last else _NOT_WORTH_A_FIT)
 
     def compare(self, queries: Queries) -> Asking[LeaderComparison | None]:
         """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None."""
         self.comparison = None
-        outcome, rule = self.end().outcome, self.rule
-        self.comparison = yield from compare_leaders(
-            self.belief, outcome, queries, beta=rule.beta, max_error=rule.error_rate
-        )
+        self.comparison = yield from compare_leaders(self.belief, self.end().outcome, queries)
         return self.comparison
 
     def _weight(self, orientation_deg: float) -> float | None:  # noqa: ARG002
@@ -492,16 +471,6 @@ class DenseSession:
         return None
 
     def _decide(self, *, last: bool = False) -> StopDecision:
-        return self._by_rule(self.belief, self.belief.queries if last else self.max_views)
-
-    def _by_rule(self, belief: Belief, max_views: int) -> StopDecision:
-        return self.rule.decide(belief, max_views=max_views, reliable=self._reliable, same_bench=self._like_enrollment)
-
-    def _complete(self) -> None:
-        """Decide again before an end if an object that was left out after the first view can be first or second."""
-        if len(self.belief.index) == len(self._index):
-            return
-        found = completed(self.belief, self._index)
-        if found is not self.belief:
-            self._so_far = self.belief = found
-            self.decision = self._decide()
+        last = last or self.belief.queries >= self.max_views
+        fit = None if self.verification is None else self.verification.fit
+        return decide(self.belief, last=last, reliable=self._reliable, fit=fit, other_bench=self._other_bench)

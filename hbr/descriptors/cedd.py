@@ -15,12 +15,11 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hbr.core.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray, check_image
 from hbr.descriptors.base import Comparison, Descriptor
-from hbr.descriptors.similarity import squares, tanimoto, tanimoto_of_dots
-from hbr.kernels import calls
+from hbr.descriptors.similarity import MANY, tanimoto, tanimoto_of_dots
+from hbr.kernels import calls, library
 from hbr.segmentation import Segmentation
 
 Trapezoid = tuple[float, float, float, float]
@@ -470,7 +469,7 @@ class Cedd(Descriptor):
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
         self.check_rows(rows)
-        return _Tanimoto(rows.astype(np.float32))  # float32 represents products of levels 0..7 exactly
+        return _Tanimoto(rows)
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return tanimoto(a, b)
@@ -484,8 +483,8 @@ class Cedd(Descriptor):
         return np.packbits(bits.reshape(len(rows), BITS * BINS), axis=1)
 
     def unpack_rows(self, packed: bytes) -> LevelArray:
-        threes = self.packed_rows(packed).reshape(-1, BINS // 8, BITS).astype(np.uint32)  # 3 bytes are 8 levels
-        bits = threes[..., 0] << 16 | threes[..., 1] << 8 | threes[..., 2]
+        first, second, third = self.packed_rows(packed).reshape(-1, BINS // 8, BITS).T  # 3 bytes are 8 levels
+        bits = first.T.astype(np.uint32) << 16 | second.T.astype(np.uint32) << 8 | third.T
         levels = np.empty((*bits.shape, 8), np.uint8)
         for place in range(8):
             levels[..., place] = bits >> (21 - BITS * place) & 7
@@ -522,7 +521,7 @@ class RotatedCedd(Cedd):
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
         self.check_rows(rows)
-        return _Rotated(_Tanimoto(rows.astype(np.float32)))
+        return _Rotated(_Tanimoto(rows))
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return _largest([tanimoto(a[..., places], b) for places in _ROTATIONS])
@@ -537,24 +536,23 @@ def _largest(similar: list[FloatArray]) -> FloatArray:
 
 
 class _Tanimoto:
-    def __init__(self, rows: NDArray[np.float32]) -> None:
+    def __init__(self, rows: LevelArray) -> None:
         self._rows = rows
-        self._squares = squares(rows)
+        self._compiled = None if library() is None else calls.ByteRows(rows)
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
-        own = queries.astype(np.float32)
-        return tanimoto_of_dots((own @ self._rows.T).astype(np.float64), squares(own)[:, None], self._squares)
-
-    def only(self, rows: IndexArray, /) -> "_Tanimoto":
-        return _Tanimoto(self._rows[rows])
+        if self._compiled is None or len(queries) >= MANY:
+            return tanimoto(queries, self._rows)
+        _CEDD.check_rows(queries)
+        return self._compiled.similarity(queries)
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         return self.rotated_among(rows, (np.arange(BINS),))
 
     def rotated_among(self, rows: IndexArray, rotations: Sequence[IndexArray]) -> FloatArray:
         """Return the largest similarity of rows within groups, over rotations of the first row, (g, k, k)."""
-        part, lengths = self._rows[rows], self._squares[rows]
-        columns = part.transpose(0, 2, 1)
+        part = self._rows[rows].astype(np.float32)  # represents products of levels 0..7 exactly
+        columns, lengths = part.transpose(0, 2, 1), np.einsum("gij,gij->gi", part, part).astype(np.float64)
         dots = np.maximum.reduce([part[:, :, places] @ columns for places in rotations]).astype(np.float64)
         return tanimoto_of_dots(dots, lengths[:, :, None], lengths[:, None, :])
 
@@ -565,9 +563,6 @@ class _Rotated:
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
         return _largest([self._plain.similarity(queries[:, places]) for places in _ROTATIONS])
-
-    def only(self, rows: IndexArray, /) -> "_Rotated":
-        return _Rotated(self._plain.only(rows))
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         return self._plain.rotated_among(rows, _ROTATIONS)

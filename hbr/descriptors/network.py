@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.core.nets import Floats, SharedNet
-from hbr.descriptors.base import Descriptor, Shift
+from hbr.descriptors.base import Descriptor
 from hbr.descriptors.similarity import RootCosine
 from hbr.segmentation import Segmentation
 
@@ -108,11 +108,6 @@ class Network(Descriptor):
 
     def entries(self, rows: LevelArray) -> NDArray[np.float64]:
         return unit(rows).astype(np.float64)
-
-    def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:
-        if not shift.learned:
-            return levels
-        return to_levels((unit(levels[None])[0] + shift.of_learned(self.length)).astype(np.float32))
 
     def prepared(self, rows: LevelArray, /) -> RootCosine:
         self.check_rows(rows)

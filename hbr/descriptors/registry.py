@@ -8,16 +8,15 @@ from typing import Final
 import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor, Shift
+from hbr.descriptors.base import Comparison, Descriptor
 from hbr.descriptors.cedd import Cedd, RotatedCedd
 from hbr.descriptors.edges_and_colours import Colours, Edges
 from hbr.descriptors.network import Network
-from hbr.kernels.calls import Measure
 from hbr.segmentation import Background, Segmentation, segment
 
 
 @dataclass(frozen=True)
-class Joined(CompiledDescriptor):
+class Joined(Descriptor):
     """Descriptors side by side. The similarity is the mean of theirs, with weights that add up to 1."""
 
     name: str = ""
@@ -41,34 +40,21 @@ class Joined(CompiledDescriptor):
         found = view if isinstance(view, Segmentation) else segment(view)
         return np.concatenate([part.describe(found) for part in self.parts])
 
-    def compared(self, rows: LevelArray, /) -> "_Average":
+    def prepared(self, rows: LevelArray, /) -> "_Average":
+        self.check_rows(rows)
         columns = self._columns()
         parts = [part.prepared(rows[:, own]) for part, own in zip(self.parts, columns, strict=True)]
         return _Average(parts, self.weights, columns)
 
-    def measure(self) -> Measure | None:
-        """Return how edges and colours, in this order, are compared; other pairs are left to NumPy."""
-        measures = [part.measure() if isinstance(part, CompiledDescriptor) else None for part in self.parts]
-        edges, colours = measures if len(measures) == 2 else (None, None)
-        if edges is None or colours is None or edges.edges_at or colours.colours_at:
-            return None
-        edges_share, colours_share = self.weights
-        return colours._replace(
-            edges_at=0,
-            colours_at=self.parts[0].size_bytes,
-            edge_values=edges.edge_values,
-            edges_share=edges_share,
-            colours_share=colours_share,
-        )
+    def opened(self, packed: LevelArray, /) -> "_Average":
+        self.check_packed(packed)
+        columns = zip(self.parts, self._packed_columns(), strict=True)
+        return _Average([part.opened(packed[:, own]) for part, own in columns], self.weights, self._columns())
 
     def entries(self, rows: LevelArray) -> FloatArray:
         return np.concatenate(
             [part.entries(rows[:, own]) for part, own in zip(self.parts, self._columns(), strict=True)], axis=1
         )
-
-    def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:
-        parts = zip(self.parts, self._columns(), strict=True)
-        return np.concatenate([part.shifted(levels[own], shift) for part, own in parts])
 
     def similarity_of_means(self, means: FloatArray) -> FloatArray:
         similar = [
@@ -82,7 +68,7 @@ class Joined(CompiledDescriptor):
 
     def unpack_rows(self, packed: bytes) -> LevelArray:
         rows = self.packed_rows(packed)
-        columns = zip(self.parts, _slices([part.size_bytes for part in self.parts]), strict=True)
+        columns = zip(self.parts, self._packed_columns(), strict=True)
         return np.concatenate([part.unpack_rows(rows[:, own].tobytes()) for part, own in columns], axis=1)
 
     def check_levels(self, rows: LevelArray) -> None:
@@ -91,6 +77,9 @@ class Joined(CompiledDescriptor):
 
     def _columns(self) -> list[slice]:
         return _slices([part.length for part in self.parts])
+
+    def _packed_columns(self) -> list[slice]:
+        return _slices([part.size_bytes for part in self.parts])
 
 
 @dataclass(frozen=True)
@@ -104,10 +93,6 @@ class Weighted(Joined):
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
         return np.concatenate([part.describe(view) for part in self.parts])
 
-    def measure(self) -> Measure | None:
-        """Return None: the kernels know only the registered pair of edges and colours."""
-        return None
-
 
 class _Average:
     def __init__(self, parts: Sequence[Comparison], weights: Sequence[float], columns: Sequence[slice]) -> None:
@@ -116,9 +101,6 @@ class _Average:
     def similarity(self, queries: LevelArray, /) -> FloatArray:
         similar = [p.similarity(queries[:, own]) for p, own in zip(self._parts, self._columns, strict=True)]
         return _weighted(self._weights, similar)
-
-    def only(self, rows: IndexArray, /) -> "_Average":
-        return _Average([part.only(rows) for part in self._parts], self._weights, self._columns)
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         return _weighted(self._weights, [part.among(rows) for part in self._parts])
@@ -136,6 +118,10 @@ def _slices(lengths: list[int]) -> list[slice]:
     return [slice(end - length, end) for end, length in zip(ends, lengths, strict=True)]
 
 
+#: Names of the rig's own descriptors of the object: without the network, and with it.
+LIGHT: Final = "edges+colours+cedd"
+FULL: Final = "edges+colours+cedd+network"
+
 _CEDD: Final = Cedd()
 _EDGES: Final = Edges()
 _COLOURS: Final = Colours()
@@ -150,8 +136,8 @@ _KNOWN: Final[dict[str, Descriptor]] = {
         _EDGES,
         _NETWORK,
         Joined("cedd+colours", 1, (_CEDD, _COLOURS), (0.5, 0.5)),
-        Joined("edges+colours", 1, (_EDGES, _COLOURS), (0.6, 0.4)),
-        Joined("edges+colours+network", 1, (_EDGES, _COLOURS, _NETWORK), (0.09, 0.06, 0.85)),
+        Joined(LIGHT, 1, (_EDGES, _COLOURS, _CEDD), (0.36, 0.36, 0.28)),
+        Joined(FULL, 1, (_EDGES, _COLOURS, _CEDD, _NETWORK), (0.09, 0.09, 0.07, 0.75)),
     )
 }
 
@@ -162,7 +148,7 @@ _ROUNDING: Final = 1e-9
 def descriptor(name: str) -> Descriptor:
     """Return the descriptor of this name. Opens no file: names come from saved runs and from other users' catalogs.
 
-    ``cedd=0.5,edges+colours=0.5`` is several descriptors with weights. The similarity is the sum of theirs.
+    ``edges=0.5,network=0.5`` is several descriptors with weights. The similarity is the sum of theirs.
 
     Raises
     ------
@@ -187,7 +173,7 @@ def _with_weights(name: str) -> Descriptor:
     # weights that add up to 1 keep the meaning of ω
     if not weights or min(weights) <= 0 or abs(sum(weights) - 1) > _ROUNDING:
         raise ValueError(
-            f"descriptors {name!r}: give each a weight above 0, and all together 1, e.g. cedd=0.5,edges+colours=0.5"
+            f"descriptors {name!r}: give each a weight above 0, and all together 1, e.g. edges=0.5,network=0.5"
         )
     kinds = tuple(descriptor(kind) for kind, _, _ in parts)
     version = int("".join(str(kind.version) for kind in kinds))
@@ -208,6 +194,11 @@ def names() -> tuple[str, ...]:
     return tuple(_KNOWN)
 
 
+def best() -> str:
+    """Return the name of the best descriptor that can describe views here: `FULL` if the network is installed."""
+    return FULL if _KNOWN[FULL].can_describe else LIGHT
+
+
 _named = descriptor  # `describe` has a parameter of this name
 
 
@@ -220,13 +211,13 @@ def describe(
     """Return the levels of an image by the paper's CEDD, or by another descriptor.
 
     ``describe(image)`` is the paper's descriptor of the whole image, scaled to a size that CEDD's grid covers.
-    ``describe(image, descriptor="edges+colours", empty_table=empty)`` is the rig's own: the object is cut out and
+    ``describe(image, descriptor="edges+colours+cedd", empty_table=empty)`` is the rig's own: the object is cut out and
     scaled, and its illumination corrected to that of the empty-table image (`hbr.segment`), if that is reliable. Enroll
     and search by the same descriptor, and compare by its ``similarity``::
 
         table = hbr.Background(cv2.imread("empty.png"))
-        levels = hbr.describe(frame, descriptor="edges+colours", empty_table=table)
-        hbr.descriptor("edges+colours").similarity(levels[None], enrolled)
+        levels = hbr.describe(frame, descriptor="edges+colours+cedd", empty_table=table)
+        hbr.descriptor("edges+colours+cedd").similarity(levels[None], enrolled)
 
     Parameters
     ----------

@@ -6,6 +6,7 @@ Source of the coefficient: Eq. 1 of Czúni and Rashad, Sensors 2018, 18(3), 801.
 from collections.abc import Callable
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +15,9 @@ from hbr.kernels import library
 from hbr.kernels.calls import ByteRows
 
 #: From this number of rows on, a matrix product is as fast as the compiled kernel.
-_MANY: Final = 8
+MANY: Final = 8
+#: Rows that are converted to float at once for a matrix product.
+_ROWS_AT_ONCE: Final = 8192
 
 Descriptors = NDArray[np.uint8] | FloatArray
 
@@ -46,14 +49,18 @@ def tanimoto(a: Descriptors, b: Descriptors) -> FloatArray:
             f"descriptors of shapes {np.shape(a)} and {np.shape(b)}; both need the shape (rows, d) with the same d"
         )
     is_short = rows_a.dtype == rows_b.dtype == np.uint8 and rows_a.shape[1] <= ByteRows.LONGEST
-    if is_short and len(rows_a) < _MANY and library() is not None:
+    if is_short and len(rows_a) < MANY and library() is not None:
         return ByteRows(np.asarray(rows_b, np.uint8)).similarity(np.asarray(rows_a, np.uint8))
     # float32 represents every dot product of uint8 rows up to this length exactly, float64 of any length
     of_bytes = rows_a.dtype == rows_b.dtype == np.uint8 and rows_a.shape[1] * 255**2 < 2**24
     kind = np.float32 if of_bytes else np.float64
     x: NDArray[np.floating] = rows_a.astype(kind)
-    y: NDArray[np.floating] = rows_b.astype(kind)
-    return tanimoto_of_dots((x @ y.T).astype(np.float64), squares(x)[:, None], squares(y))
+    similar = np.empty((len(x), len(rows_b)))
+    for start in range(0, len(rows_b), _ROWS_AT_ONCE):  # floats need several times the memory of levels
+        part = slice(start, start + _ROWS_AT_ONCE)
+        y: NDArray[np.floating] = rows_b[part].astype(kind)
+        similar[:, part] = tanimoto_of_dots((x @ y.T).astype(np.float64), squares(x)[:, None], squares(y))
+    return similar
 
 
 def tanimoto_of_dots(dots: FloatArray, squares_a: FloatArray, squares_b: FloatArray) -> FloatArray:
@@ -72,8 +79,6 @@ Rows = NDArray[np.float32]
 
 #: Products are added up in blocks of this many columns.
 _BLOCK: Final = 64
-#: Unit into whose multiples and the rest the values of a query are split: 64 products of 4095 and 63 are below 2**24.
-_UNIT: Final = 64.0
 #: Rows that are converted to float at once.
 _CHUNK: Final = 256
 #: Cosines that are computed at once, so that they stay in the processor's cache between blocks.
@@ -83,8 +88,7 @@ _AT_ONCE: Final = 65536
 class RootCosine:
     """A `Comparison` of rows of unit length by the square root of the cosine, to 1e-6; 0 if that is negative.
 
-    The dense filter raises similarities to the fourth power. The root leaves the second one, so that also views count
-    whose cosine is small on another bench.
+    With the root, also views count whose cosine is small on another bench.
 
     A matrix product adds up float32 in one accumulator for each result. Levels take few values, so that equal products
     are rounded in the same direction many times: over 512 columns the error is up to 5e-6. Therefore the rows are
@@ -112,9 +116,6 @@ class RootCosine:
             np.clip(total, 0, 1, out=cosine[:, part])
         return np.sqrt(cosine)
 
-    def only(self, rows: IndexArray, /) -> "RootCosine":
-        return RootCosine(self._to_unit, np.take(self._blocks, rows, axis=1))
-
     def among(self, rows: IndexArray, /) -> FloatArray:
         part = np.take(self._blocks, rows, axis=1)
         products = part @ part.transpose(0, 1, 3, 2)
@@ -125,60 +126,47 @@ class RootCosine:
         return similar
 
 
-class WholeCosine:
-    """A `Comparison` of rows of whole numbers, exact up to the division by the lengths: the same on every computer.
+#: Number of ones in each byte.
+_ONES: Final = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
+#: Packed rows that are compared at once.
+_PACKED_AT_ONCE: Final = 2048
 
-    The products are added up in float32, in blocks of columns whose sums are below 2**24. For that, the values of a
-    query are split into two parts, of 64 and of 1.
+
+class BitCosine:
+    """A `Comparison` of rows of bits by the cosine, exact up to the division: the same on every computer.
+
+    Parameters
+    ----------
+    packed : uint8 array (n, bytes)
+        The bits, as `numpy.packbits` packs them. They stay packed.
     """
 
-    def __init__(self, values: NDArray[np.int32], blocks: Rows, squares: FloatArray) -> None:
-        self._values, self._blocks, self._squares = values, blocks, squares
-
-    @classmethod
-    def of(cls, rows: LevelArray, values: NDArray[np.int32]) -> "WholeCosine":
-        """Prepare rows of levels, uint8 (n, length)."""
-        table = values.astype(np.float32)
-        return cls(values, _blocks(rows, table.take), _whole_squares(rows, values))
+    def __init__(self, packed: LevelArray) -> None:
+        self._packed, self._ones = packed, _common(packed, np.full((1, packed.shape[1]), 255, np.uint8))[0]
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
-        parts = [_blocks(queries, part.take) for part in _split(self._values.astype(np.float32))]
-        dots = np.zeros((len(queries), self._blocks.shape[1]))
-        for rows, *own in zip(self._blocks, *parts, strict=True):
-            for query, unit in zip(own, (_UNIT, 1.0), strict=True):
-                dots += unit * (query @ rows.T).astype(np.float64)
-        return _cosine(dots, _whole_squares(queries, self._values)[:, None], self._squares)
-
-    def only(self, rows: IndexArray, /) -> "WholeCosine":
-        return WholeCosine(self._values, np.take(self._blocks, rows, axis=1), self._squares[rows])
+        own = np.packbits(queries, axis=1)
+        return _cosine(_common(self._packed, own), _common(own, own).diagonal()[:, None], self._ones)
 
     def among(self, rows: IndexArray, /) -> FloatArray:
-        dots = np.zeros((*rows.shape, rows.shape[-1]))
-        for block in self._blocks:
-            columns = block[rows].transpose(0, 2, 1)
-            for query, unit in zip(_split(block[rows]), (_UNIT, 1.0), strict=True):
-                dots += unit * (query @ columns).astype(np.float64)
-        lengths = self._squares[rows]
-        return _cosine(dots, lengths[:, :, None], lengths[:, None, :])
+        bits = np.unpackbits(self._packed[rows], axis=2).astype(np.float32)
+        ones = self._ones[rows]
+        return _cosine((bits @ bits.transpose(0, 2, 1)).astype(np.float64), ones[:, :, None], ones[:, None, :])
 
 
-def _split(values: Rows) -> tuple[Rows, Rows]:
-    """Return values as multiples of 64, and the rest."""
-    high = np.floor(values / np.float32(_UNIT))
-    return high, values - np.float32(_UNIT) * high
+def _common(packed: LevelArray, queries: LevelArray) -> FloatArray:
+    """Return the number of ones that packed queries, (n, bytes), and rows, (m, bytes), have in common, (n, m)."""
+    common = np.empty((len(queries), len(packed)))
+    for start in range(0, len(packed), _PACKED_AT_ONCE):
+        rows = packed[start : start + _PACKED_AT_ONCE]
+        for query, found in zip(queries, common[:, start : start + len(rows)], strict=True):
+            found[:] = cv2.reduce(cv2.LUT(rows & query, _ONES), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S)[:, 0]
+    return common
 
 
-def _whole_squares(rows: LevelArray, values: NDArray[np.int32]) -> FloatArray:
-    squares = np.empty(len(rows))
-    table = values.astype(np.float64) ** 2
-    for start in range(0, len(rows), _CHUNK):
-        squares[start : start + _CHUNK] = table[rows[start : start + _CHUNK]].sum(axis=1)
-    return squares
-
-
-def _cosine(dots: FloatArray, squares_a: FloatArray, squares_b: FloatArray) -> FloatArray:
-    similar: FloatArray = np.minimum(dots / np.sqrt(squares_a * squares_b), 1)
-    return similar
+def _cosine(common: FloatArray, ones_a: FloatArray, ones_b: FloatArray) -> FloatArray:
+    length = np.sqrt(ones_a * ones_b)
+    return np.divide(common, length, out=np.zeros_like(common), where=length > 0)
 
 
 def _blocks(rows: LevelArray, to_unit: Callable[[LevelArray], Rows]) -> Rows:

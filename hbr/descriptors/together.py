@@ -58,23 +58,8 @@ class LearnedBackground:
         return Background.learned([self._small[n] for n in others], self._shape)
 
 
-#: Methods whose segmentations are as good as those of enrolled views.
-_EXACT: Final = (BoxMethod.PLAIN_BACKGROUND, BoxMethod.EMPTY_TABLE)
 #: Methods that use a known background.
-RELIABLE: Final = (*_EXACT, BoxMethod.ROTATION)
-
-
-def like_enrollment(method: str, same_bench: bool | None) -> bool | None:
-    """Return whether a view is described under the conditions of the enrollment; None: not known.
-
-    Parameters
-    ----------
-    method : str
-        A `BoxMethod`. A segmentation by rotation changes a description as much as another bench does.
-    same_bench : bool or None
-        Whether the bench is that of the enrollment; None: not known.
-    """
-    return None if same_bench and method not in _EXACT else same_bench
+_RELIABLE: Final = (BoxMethod.PLAIN_BACKGROUND, BoxMethod.EMPTY_TABLE, BoxMethod.ROTATION)
 
 
 class ViewsTogether:
@@ -82,7 +67,7 @@ class ViewsTogether:
 
     ::
 
-        views = hbr.ViewsTogether("edges+colours")
+        views = hbr.ViewsTogether("edges+colours+cedd")
         for frame, orientation_deg in frames:
             views.add(frame, table)  # or without an empty-table image
             *earlier, levels = views.levels
@@ -151,12 +136,12 @@ class ViewsTogether:
     @property
     def reliable(self) -> bool:
         """Whether the last view was segmented by a known background; without an empty-table image the first was not."""
-        return self.segmentations[-1][0].method in RELIABLE
+        return self.segmentations[-1][0].method in _RELIABLE
 
     def revise(self) -> None:
         """Segment the views whose background was not known again, with the background that the other views show."""
         for view, found in enumerate(self.segmentations):
-            if self._frames[view] is not None and (not found or found[0].method not in RELIABLE):
+            if self._frames[view] is not None and (not found or found[0].method not in _RELIABLE):
                 self._describe(view, guess=self._several)
 
     def _describe(self, view: int, *, guess: bool = False) -> None:

@@ -6,22 +6,21 @@ photographs are used as they are, all objects are enrolled, and the views of sea
 The drawn benches have texture and clutter, or all of them have one plain backdrop with a visible platter.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, lru_cache, partial
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
-from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import LocalView
 from hbr.dense.pose import pose
-from hbr.dense.session import DenseSession, answered, near
-from hbr.dense.stopping import Outcome, StoppingRule
+from hbr.dense.session import DenseSession, Queries, answered, near
+from hbr.dense.stopping import Outcome
 from hbr.descriptors.together import ViewsTogether
 from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
 from hbr.evaluation.condition import Condition
@@ -69,8 +68,12 @@ class SearchResult:
         Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.session`).
     pose : StatedPose
         Of the leading object at the end.
+    probability, not_enrolled : float
+        Stated probabilities of the decided object, and that the object is not enrolled.
     left_out : Outcome, optional
         Outcome of the same search if the object is not enrolled; None if it never was.
+    left_out_probability, left_out_not_enrolled : float, optional
+        The stated probabilities of that search.
     """
 
     leaders: tuple[str, ...]
@@ -81,7 +84,11 @@ class SearchResult:
     compared: bool = False
     by_comparison: bool = False
     verified: bool = False
+    probability: float = 0.0
+    not_enrolled: float = 0.0
     left_out: Outcome | None = None
+    left_out_probability: float | None = None
+    left_out_not_enrolled: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +105,14 @@ class EnrolledViews:
     levels: LevelArray
     azimuth_deg: NDArray[np.float64]
     cut_outs: tuple[LocalView, ...]
+
+
+class _Scene(Protocol):
+    """What the camera sees during an enrollment or a search: frames and the empty table, uint8 (H, W, 3)."""
+
+    def empty(self) -> ImageArray: ...
+
+    def frame(self, item: PhotographedObject, place: int) -> ImageArray: ...
 
 
 def enroll_changed(item: PhotographedObject, experiment: Experiment) -> EnrolledViews:
@@ -128,16 +143,13 @@ def search_changed(
     item: PhotographedObject,
     experiment: Experiment,
     index: DenseIndex,
-    rule: StoppingRule,
-    example: PhotographedObject,
     enrolled: Callable[[str], EnrolledViews],
 ) -> list[SearchResult]:
     """Search for an object, once for each trial.
 
-    As on the rig, the first frame is compared with the enrollment's picture, or without one with a view of an enrolled
-    object, the ``example``. An enrolled object is also searched for as if it were not enrolled. The rule is the same
-    then, because it is fitted to the searches for all enrolled objects. ``enrolled`` returns the enrolled views of an
-    object, for the comparison of two leaders.
+    As on the rig, the empty-table image is compared with that of the enrollment. An enrolled object is also searched
+    for as if it were not enrolled. ``enrolled`` returns the enrolled views of an object, for the pixel by pixel
+    comparisons.
 
     Raises
     ------
@@ -145,66 +157,104 @@ def search_changed(
         A photograph cannot be used.
     """
     results = []
-    picture, protocol = _has_picture(experiment), experiment.protocol
-    before = _bench_image(experiment, None if picture else example)
     left_out = _without(index, item.name)
-    for trial in range(protocol.trials):
-        rng = generator(protocol.seed, item.name, "trial", trial)
-        scene = _search_scene(experiment, rng)
-        first_deg = rng.uniform(0, 360)
-        kind = experiment.condition.descriptor
-        views, empty = ViewsTogether(kind), Background(scene.empty()) if picture else None
-        search = _Search(index, rule, enrolled)
-        without = None if left_out is None else _Search(left_out, rule, enrolled)
-        same_bench, first = None, True
-        wanted_deg = first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)
-        for place in _query_places(item, experiment, wanted_deg):
-            azimuth_deg = item.photographs[place].azimuth_deg
-            frame = scene.frame(item, place)
-            if first:
-                same_bench, first = before.shows_same_bench(frame), False
-            views.add(frame, empty)
-            search.add(views, azimuth_deg, same_bench)
+    for views_so_far in searches(item, experiment):
+        search = _Search(index, enrolled)
+        without = None if left_out is None else _Search(left_out, enrolled)
+        for views, azimuth_deg in views_so_far.views:
+            search.add(views, azimuth_deg, views_so_far.other_bench)
             if without is not None:
-                without.add(views, azimuth_deg, same_bench)
+                without.add(views, azimuth_deg, views_so_far.other_bench)
         result = search.result()
-        results.append(result if without is None else replace(result, left_out=without.result().outcome))
+        results.append(result if without is None else _with_left_out(result, without.result()))
     return results
+
+
+class SearchViews(NamedTuple):
+    """The views of a search.
+
+    Attributes
+    ----------
+    views
+        Yields the views so far, and the azimuth of the last one in degrees.
+    other_bench
+        Whether its empty-table image certainly shows another bench than that of the enrollment.
+    """
+
+    views: Iterator[tuple[ViewsTogether, float]]
+    other_bench: bool
+
+
+def searches(item: PhotographedObject, experiment: Experiment) -> Iterator[SearchViews]:
+    """Yield a search for each trial.
+
+    Raises
+    ------
+    DatasetError
+        A photograph cannot be used.
+    """
+    before = Background(_enrollment_scene(experiment).empty()) if _has_picture(experiment) else None
+    for trial in range(experiment.protocol.trials):
+        rng = generator(experiment.protocol.seed, item.name, "trial", trial)
+        scene = _search_scene(experiment, rng)
+        wanted_deg = rng.uniform(0, 360) + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)
+        empty = None if before is None else scene.empty()
+        other_bench = before is not None and empty is not None and before.shows_another_bench(empty)
+        yield SearchViews(_views_so_far(item, experiment, scene, empty, wanted_deg), other_bench)
+
+
+def _views_so_far(
+    item: PhotographedObject,
+    experiment: Experiment,
+    scene: _Scene,
+    empty: ImageArray | None,
+    wanted_deg: NDArray[np.float64],
+) -> Iterator[tuple[ViewsTogether, float]]:
+    views = ViewsTogether(experiment.condition.descriptor)
+    table = None if empty is None else Background(empty)
+    for place in _query_places(item, experiment, wanted_deg):
+        views.add(scene.frame(item, place), table)
+        yield views, item.photographs[place].azimuth_deg
+
+
+def _with_left_out(result: SearchResult, other: SearchResult) -> SearchResult:
+    return replace(
+        result,
+        left_out=other.outcome,
+        left_out_probability=other.probability,
+        left_out_not_enrolled=other.not_enrolled,
+    )
 
 
 class _Search:
     """A search that continues after its end, to record the leading object after each view."""
 
-    def __init__(self, index: DenseIndex, rule: StoppingRule, enrolled: Callable[[str], EnrolledViews]) -> None:
-        self._session = DenseSession(index, rule, max_views=VIEWS, most_changes=0)
+    def __init__(self, index: DenseIndex, enrolled: Callable[[str], EnrolledViews]) -> None:
+        self._session = DenseSession(index, max_views=VIEWS, most_changes=0)
         self._names = index.views.object_names
         self._enrolled = enrolled
         self._leaders: list[str] = []
         self._result: SearchResult | None = None
 
-    def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool | None) -> None:
-        *earlier, levels = views.levels
-        decision = self._session.add(
-            levels,
-            azimuth_deg,
-            earlier=earlier,
-            reliable=views.reliable,
-            same_bench=same_bench,
-            segmented_by=views.segmentations[-1][0].method,
-        )
-        self._leaders.append(self._names[int(self._session.belief.ranking().object_index[0])])
-        if self._result is None and decision.outcome is not Outcome.CONTINUE:
-            self._result = self._ended(views)
-
-    def _ended(self, views: ViewsTogether) -> SearchResult:
-        """Return the result of a search that ends with its last steps."""
+    def add(self, views: ViewsTogether, azimuth_deg: float, other_bench: bool) -> None:
         session = self._session
+        *earlier, levels = views.levels
+        session.add(levels, azimuth_deg, earlier=earlier, reliable=views.reliable, other_bench=other_bench)
+        self._leaders.append(self._names[int(session.belief.ranking().object_index[0])])
+        if self._result is not None:
+            return
         orientations_deg = session.belief.orientation_deg.tolist()
 
         def queries(n: int) -> list[LocalView]:
             return [LocalView(one.crop, one.mask, orientations_deg[n]) for one in views.segmentations[n]]
 
-        verification = answered(session.verify(queries), self._near)
+        answered(session.verify(queries), self._near)
+        if session.decision.outcome is not Outcome.CONTINUE:
+            self._result = self._ended(queries)
+
+    def _ended(self, queries: Queries) -> SearchResult:
+        """Return the result of a search that ends after its last view."""
+        session = self._session
         before = session.end()
         comparison = answered(session.compare(queries), self._near)
         end = session.end()
@@ -216,7 +266,9 @@ class _Search:
             self._stated(end.object_index),
             comparison is not None,
             end.outcome is not before.outcome,
-            verification is not None,
+            session.verification is not None,
+            end.probability,
+            end.not_enrolled,
         )
 
     def _stated(self, leader: int) -> StatedPose:
@@ -238,19 +290,26 @@ def _without(index: DenseIndex, name: str) -> DenseIndex | None:
     """Return the index as if an object were not enrolled; None if it is not."""
     if name not in index.views.object_names:
         return None
-    # a new index: the whitening of this one contains the object's views
+    # a new index: the space of this one contains the object's views
     return DenseIndex(index.views.select(index.views.object_index != index.views.object_names.index(name)))
 
 
 def summary(
     known: dict[str, list[SearchResult]], unknown: dict[str, list[SearchResult]]
 ) -> dict[str, float | int | None]:
-    """Return the rates of each outcome, for enrolled objects and for others, by names with units."""
+    """Return the rates of each outcome, for enrolled objects and for others, by names with units.
+
+    Of all searches that ended with an object, for enrolled objects and for left-out ones, ``accepted_stated`` is the
+    mean stated probability, and ``accepted_right`` the share of right ones. The keys ``..._not_enrolled`` have the mean
+    stated probability that the object is not enrolled.
+    """
     searches = [(name, one) for name, results in known.items() for one in results]
     others = [one for results in unknown.values() for one in results]
     count, unknown_count = max(1, len(searches)), max(1, len(others))
     found = [(name, one) for name, one in searches if one.outcome is Outcome.FOUND]
-    left_out = [one.left_out for _, one in searches if one.left_out is not None]
+    left_out = [one for _, one in searches if one.left_out is not None]
+    accepted = [one for one in left_out if one.left_out is Outcome.FOUND]
+    stated = [one.probability for _, one in found] + [one.left_out_probability for one in accepted]
     return {
         "searches": len(searches),
         **{f"hit_rate_{n}": sum(one.leaders[n - 1] == name for name, one in searches) / count for n in (1, 2, VIEWS)},
@@ -268,8 +327,17 @@ def summary(
         "unknown_accepted": sum(one.outcome is Outcome.FOUND for one in others) / unknown_count,
         "unknown_called_unknown": sum(one.outcome is Outcome.UNKNOWN for one in others) / unknown_count,
         "left_out_searches": len(left_out),
-        "left_out_accepted": left_out.count(Outcome.FOUND) / max(1, len(left_out)),
+        "left_out_accepted": len(accepted) / max(1, len(left_out)),
+        "accepted_searches": len(stated),
+        "accepted_stated": _mean(stated),
+        "accepted_right": _mean([one.decided == name for name, one in found] + [False] * len(accepted)),
+        "enrolled_not_enrolled": _mean([one.not_enrolled for _, one in searches]),
+        "left_out_not_enrolled": _mean([one.left_out_not_enrolled for one in left_out]),
     }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    return float(np.mean(np.array(values, np.float64))) if values else None
 
 
 def intervals(known: dict[str, list[SearchResult]], rng: np.random.Generator) -> dict[str, float]:
@@ -285,14 +353,6 @@ def intervals(known: dict[str, list[SearchResult]], rng: np.random.Generator) ->
 def is_enrolled(place: int, experiment: Experiment) -> bool:
     """Return whether the object at this place of the data set is enrolled."""
     return experiment.change == "none" or (place + 1) % _NEVER_ENROLLED != 0
-
-
-class _Scene(Protocol):
-    """What the camera sees during an enrollment or a search: frames and the empty table, uint8 (H, W, 3)."""
-
-    def empty(self) -> ImageArray: ...
-
-    def frame(self, item: PhotographedObject, place: int) -> ImageArray: ...
 
 
 @dataclass(frozen=True)
@@ -371,12 +431,6 @@ def nearest_photographs(item: PhotographedObject, azimuth_deg: NDArray[np.float6
     return [int(np.abs(wrap180(item.azimuth_deg - one)).argmin()) for one in azimuth_deg.tolist()]
 
 
-def _bench_image(experiment: Experiment, example: PhotographedObject | None) -> Background:
-    """Return the image that a catalog has of the enrollment's bench: the empty-table image, or a view of an object."""
-    scene = _enrollment_scene(experiment)
-    return Background(scene.empty() if example is None else scene.frame(example, 0))
-
-
 @cache
 def _enrollment_bench(plain: bool) -> DrawnBench:
     return DrawnBench.drawn(np.random.default_rng(7), textured=0.35, clutter=3, plain=plain)
@@ -401,31 +455,28 @@ def _enrolled(experiment: Experiment, dataset: Dataset, name: str) -> EnrolledVi
 
 def _model(
     experiment: Experiment, dataset: Dataset, enrolled: list[tuple[LevelArray, NDArray[np.float64]] | None]
-) -> tuple[Views, StoppingRule]:
+) -> Views:
     kind, found = experiment.condition.descriptor, zip(dataset.objects, enrolled, strict=True)
     parts = [Views.of_object(item.name, *own, kind) for item, own in found if own is not None]
     if len(parts) < 2:
         raise ValueError(f"{len(parts)} object is enrolled; at least two are needed")
-    index = DenseIndex(Views.concatenate(parts))
-    return index.views, fit_stopping_rule(index).rule
+    return Views.concatenate(parts)
+
+
+@lru_cache(maxsize=1)
+def _index(views: Views) -> DenseIndex:
+    """Return the index of all objects, which each process makes once."""
+    return DenseIndex(views)
 
 
 def _search(
-    experiment: Experiment,
-    dataset: Dataset,
-    model: tuple[Views, StoppingRule],
-    _now_ns: Callable[[], int],
-    j: int,
+    experiment: Experiment, dataset: Dataset, model: Views, _now_ns: Callable[[], int], j: int
 ) -> list[SearchResult]:
     enrolled = partial(_enrolled, experiment, dataset)
-    views, rule = model
-    return search_changed(dataset.objects[j], experiment, DenseIndex(views), rule, dataset.objects[0], enrolled)
+    return search_changed(dataset.objects[j], experiment, _index(model), enrolled)
 
 
-def _results(
-    experiment: Experiment, dataset: Dataset, model: tuple[Views, StoppingRule], found: list[list[SearchResult]]
-) -> dict[str, Any]:
-    views, rule = model
+def _results(experiment: Experiment, dataset: Dataset, views: Views, found: list[list[SearchResult]]) -> dict[str, Any]:
     searched = {item.name: results for item, results in zip(dataset.objects, found, strict=True)}
     words = f"{experiment.change}{', plain' * experiment.plain}, {'' if _has_picture(experiment) else 'no '}picture"
 
@@ -443,7 +494,6 @@ def _results(
     return {
         "settings": experiment.settings(dataset),
         "rows": rows,
-        "fitted": [asdict(one) for one in rule.rates],
         "searches": {name: [asdict(one) for one in results] for name, results in searched.items()},
     }
 

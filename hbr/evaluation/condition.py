@@ -1,6 +1,6 @@
 """The condition of an experiment: how the images of queries differ from those of enrolled views."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final, Literal, NamedTuple, TypeVar, get_args
@@ -111,11 +111,6 @@ class Condition:
         """Whether objects stand on a drawn bench."""
         return self.background in ("bench", "other-bench")
 
-    @property
-    def same_bench(self) -> bool | None:
-        """Whether a search knows that its bench is that of the enrollment; None: not known."""
-        return True if self.background in ("same", "bench") else None
-
     def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> EvaluationImage:
         """Return the image of an enrolled view; `rng` draws its noise."""
         image = self._sized(image_bgr)
@@ -204,13 +199,6 @@ def _textured(image: ImageArray, rng: np.random.Generator) -> ImageArray:
     return np.clip(texture, 0, 255).astype(np.uint8)
 
 
-class Queries(NamedTuple):
-    """The views of an object as queries: levels, uint8 (n, length), and how each was segmented ("": it was not)."""
-
-    levels: LevelArray
-    methods: tuple[str, ...]
-
-
 def enrolled_levels(dataset: Dataset, j: int, condition: Condition, places: Iterable[int] | None = None) -> LevelArray:
     """Return the descriptors of enrolled views of object `j`, uint8 (n, length): of all photographs, or these.
 
@@ -225,20 +213,11 @@ def enrolled_levels(dataset: Dataset, j: int, condition: Condition, places: Iter
     return _levels((condition.enrolled(image, generator(0, name, "enrolled", i)) for i, image in images), condition)
 
 
-def query_levels(dataset: Dataset, j: int, condition: Condition, seed: int) -> Queries:
+def query_levels(dataset: Dataset, j: int, condition: Condition, seed: int) -> LevelArray:
     """Return the descriptors of all views of object `j` as queries. Each has its own noise."""
-    kind = descriptor(condition.descriptor)
-    if kind.whole_image:
-        levels = _levels(_queries(dataset, j, condition, seed), condition)
-        return Queries(levels, ("",) * len(levels))
-    found = [segment(image, empty_table=empty) for image, empty in _queries(dataset, j, condition, seed)]
-    return Queries(np.stack([kind.describe(one) for one in found]), tuple(one.method.value for one in found))
-
-
-def _queries(dataset: Dataset, j: int, condition: Condition, seed: int) -> Iterator[EvaluationImage]:
     name = dataset.objects[j].name
-    for i in range(len(dataset.objects[j].photographs)):
-        yield condition.query(dataset.image(j, i), generator(seed, name, "photograph", i))
+    images = ((i, dataset.image(j, i)) for i in range(len(dataset.objects[j].photographs)))
+    return _levels((condition.query(image, generator(seed, name, "photograph", i)) for i, image in images), condition)
 
 
 def _levels(images: Iterable[EvaluationImage], condition: Condition) -> LevelArray:

@@ -9,10 +9,10 @@ from hbr.evaluation.condition import Condition
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.protocol import Method, Protocol
 
-KindName = Literal["trials", "matrix", "unknown-objects", "bench-change", "replaced"]
+KindName = Literal["trials", "matrix", "bench-change", "replaced"]
 Change = Literal["none", "mild", "hard"]
 #: Increased if the same settings give other numbers.
-FORMAT: Final = 10
+FORMAT: Final = 11
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class Experiment:
     ----------
     name : str
         Name in files and reports.
-    kind : {"trials", "matrix", "unknown-objects", "bench-change", "replaced"}
-        ``trials`` compares methods; ``matrix`` measures one perturbation at a time; ``unknown-objects`` leaves objects
-        out, and searches for them, too; ``bench-change`` searches after a change of a whole drawn bench, or in the
-        photographs as they are; ``replaced`` replaces the object during the search.
+    kind : {"trials", "matrix", "bench-change", "replaced"}
+        ``trials`` compares methods; ``matrix`` measures one perturbation at a time; ``bench-change`` searches after a
+        change of a whole drawn bench, or in the photographs as they are, also for objects that are left out;
+        ``replaced`` replaces the object during the search.
     condition : Condition
         How the images of queries differ from those of enrolled views.
     protocol : Protocol
@@ -37,8 +37,6 @@ class Experiment:
         First and last object of the data set that takes part, and that is reported, counted from 1; None: all.
     every : int
         Step between the photographs of an object that are used: with 2, every second one.
-    left_out : int
-        Objects that ``unknown-objects`` leaves out, five times.
     change : {"none", "mild", "hard"}
         The change of ``bench-change``; none: the photographs as they are, with the noise of the condition, and queries
         that are not enrolled.
@@ -56,7 +54,6 @@ class Experiment:
     objects: tuple[int, int] | None = None
     report: tuple[int, int] | None = None
     every: int = 1
-    left_out: int = 20
     change: Change = "hard"
     plain: bool = False
     margin: float = 0.02
@@ -99,7 +96,6 @@ class Experiment:
             "every": self.every,
             "change": self.change if self.kind == "bench-change" else None,
             "plain": self.plain if self.kind == "bench-change" else None,
-            "left_out": self.left_out if self.kind == "unknown-objects" else None,
         }
 
 

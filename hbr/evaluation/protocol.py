@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray
+from hbr.dense.index import OMEGA
 from hbr.dense.stopping import Outcome
 from hbr.model.views import Views
 from hbr.paper.hough import Extension
@@ -19,7 +20,7 @@ Removal = Literal["near", "paper79", "queries"]
 #: Codes of `Runs.outcome`.
 OUTCOMES: Final = (Outcome.CONTINUE, Outcome.FOUND, Outcome.UNKNOWN, Outcome.AMBIGUOUS)
 #: Codes of `Runs.compared`: what a comparison of the two leaders names.
-COMPARED: Final = ("none", "right", "wrong", "ambiguous")
+COMPARED: Final = ("none", "right", "wrong")
 
 
 Strategy = Literal[
@@ -96,15 +97,14 @@ _LISTED: Final = (
     Method("sweep-45", "sweep 45°", strategy="sweep-45"),
     Method("sweep-90", "sweep 90°", strategy="sweep-90"),
 )
-_OMEGA: Final = 2.0  # of the dense filter; from 0.25 to 8 no hit rate changes by more than a point (decision 0014)
 _DENSE: Final = (
-    Method("dense", "dense filter, next best view", "next-best-view", _OMEGA, dense=True),
-    Method("dense-coin", "dense filter, coin flip", "next-best-view-coin", _OMEGA, dense=True),
-    Method("dense-random", "dense filter, random", "random", _OMEGA, dense=True),
-    Method("dense-45", "dense filter, sweep 45°", "sweep-45", _OMEGA, dense=True),
-    Method("dense-90", "dense filter, sweep 90°", "sweep-90", _OMEGA, dense=True),
-    Method("dense-mutual", "dense filter, mutual information", "mutual", _OMEGA, dense=True),
-    Method("dense-oracle", "dense filter, oracle", "oracle", _OMEGA, dense=True),
+    Method("dense", "dense filter, next best view", "next-best-view", OMEGA, dense=True),
+    Method("dense-coin", "dense filter, coin flip", "next-best-view-coin", OMEGA, dense=True),
+    Method("dense-random", "dense filter, random", "random", OMEGA, dense=True),
+    Method("dense-45", "dense filter, sweep 45°", "sweep-45", OMEGA, dense=True),
+    Method("dense-90", "dense filter, sweep 90°", "sweep-90", OMEGA, dense=True),
+    Method("dense-mutual", "dense filter, mutual information", "mutual", OMEGA, dense=True),
+    Method("dense-oracle", "dense filter, oracle", "oracle", OMEGA, dense=True),
 )
 _HMM: Final = (
     Method("hmm", "HMM, least risk", "least-risk", hmm=True),

@@ -8,6 +8,7 @@ whether the object changed (`hbr.dense.change`).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,13 +19,14 @@ from hbr.dense.arc import ArcSession, frame_weight
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Outcome, StoppingRule
+from hbr.dense.stopping import Outcome
 from hbr.evaluation.condition import enrolled_levels, query_levels
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.protocol import generator, views_of_trial
 from hbr.evaluation.statistics import wilson
-from hbr.evaluation.trials import all_views, rule_of_trial
+from hbr.evaluation.trials import all_views
+from hbr.model.views import Views
 
 
 class _Way(NamedTuple):
@@ -97,14 +99,13 @@ class _Queries(NamedTuple):
 
 
 class _Model(NamedTuple):
-    enrolled: DenseIndex
-    rule: StoppingRule
+    enrolled: Views
     queries: tuple["_Queries", ...]
 
 
 def _enroll(experiment: Experiment, dataset: Dataset, j: int) -> _Described:
     condition, seed = experiment.condition, experiment.protocol.seed
-    return _Described(enrolled_levels(dataset, j, condition), query_levels(dataset, j, condition, seed).levels)
+    return _Described(enrolled_levels(dataset, j, condition), query_levels(dataset, j, condition, seed))
 
 
 def _model(experiment: Experiment, dataset: Dataset, described: list[_Described]) -> _Model:
@@ -114,14 +115,19 @@ def _model(experiment: Experiment, dataset: Dataset, described: list[_Described]
     for j, one in enumerate(described):
         free = ~is_enrolled[rows := views.of(j)]
         queries.append(_Queries(one.queries[free], views.azimuth_deg[rows][free]))
-    rule = rule_of_trial(views, experiment.protocol)
-    return _Model(DenseIndex(views.select(is_enrolled)), rule, tuple(queries))
+    return _Model(views.select(is_enrolled), tuple(queries))
+
+
+@lru_cache(maxsize=1)
+def _index(views: Views) -> DenseIndex:
+    """Return the index of all objects, which each process makes once."""
+    return DenseIndex(views)
 
 
 def _search(
     experiment: Experiment, dataset: Dataset, model: _Model, _now_ns: Callable[[], int], j: int
 ) -> list[ReplacedSearch]:
-    others = [k for k in range(len(dataset.objects)) if k != j]
+    enrolled, others = _index(model.enrolled), [k for k in range(len(dataset.objects)) if k != j]
     results = []
     for trial in range(experiment.protocol.trials):
         for way in _WAYS[: 1 if trial % _MOTION_EVERY else 2]:
@@ -131,7 +137,7 @@ def _search(
                 )
                 pair = (j, int(rng.choice(others)) if case == "replaced" else j)
                 absent = [k for k, is_enrolled in zip(pair, (before, after), strict=True) if not is_enrolled]
-                index = model.enrolled.only(np.flatnonzero(~np.isin(model.enrolled.object_index, absent)))
+                index = enrolled.only(np.flatnonzero(~np.isin(enrolled.object_index, absent)))
                 found = _searched(experiment, model, index, way, case, pair, rng)
                 results.append(ReplacedSearch(way.name, case, before, after, *found))
     return results
@@ -148,7 +154,7 @@ def _searched(
 ) -> tuple[bool, int | None, bool, bool, bool, bool]:
     """Search once, and return the last fields of `ReplacedSearch`; ``pair`` has the objects before and after."""
     is_moving = way.name == "in motion"
-    session = ArcSession(index, model.rule, model.rule.min_confidence) if is_moving else DenseSession(index, model.rule)
+    session = ArcSession(index) if is_moving else DenseSession(index)
     without: DenseIndex | Belief = index
     starts_deg = rng.uniform(0, 360, 2)
     if case == "rotated":
@@ -165,7 +171,7 @@ def _searched(
         if is_moving and isinstance(without, Belief):
             weight = frame_weight(float(size_deg(without.orientation_deg - measured_deg).min()))
         without = update_belief(queries.levels[place], measured_deg, without, weight=weight)
-        session.add(queries.levels[place], measured_deg, same_bench=experiment.condition.same_bench)
+        session.add(queries.levels[place], measured_deg)
         if session.change is not None and after:
             noticed = noticed or n - before + 1
         elif session.change is not None:
@@ -174,7 +180,7 @@ def _searched(
             running = running and session.decision.outcome is Outcome.CONTINUE
         camera_deg += _FRAME_DEG if is_moving else session.next_best_view().rotation_deg
     assert isinstance(without, Belief)
-    leads = [int(one.index.object_index[one.likeliest(model.rule.beta)[0]]) for one in (session.belief, without)]
+    leads = [int(one.index.object_index[one.likeliest()[0]]) for one in (session.belief, without)]
     return running, noticed, wrong, wrong_running, leads[0] == pair[1], leads[1] == pair[1]
 
 

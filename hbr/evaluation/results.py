@@ -236,12 +236,11 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
     trial = np.arange(len(end))
     step = compared[trial, end]
     # A comparison of pixels at the end replaces the ranking.
-    is_right, is_wrong, is_twin = (step == COMPARED.index(one) for one in ("right", "wrong", "ambiguous"))
-    changed = is_right | is_wrong | is_twin
+    is_right, is_wrong = (step == COMPARED.index(one) for one in ("right", "wrong"))
+    changed = is_right | is_wrong
     unknown, ambiguous = (
         (outcome[trial, end] == OUTCOMES.index(one)) & ~changed for one in (Outcome.UNKNOWN, Outcome.AMBIGUOUS)
     )
-    ambiguous |= is_twin
     named = ~unknown & ~ambiguous
     right = np.where(changed, is_right, rank[trial, end] == 1) & named
     hits = int(right.sum())

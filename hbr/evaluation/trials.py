@@ -6,6 +6,7 @@ for all methods.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -14,13 +15,12 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import BETA, Belief, update_belief
-from hbr.dense.fitting import fit_stopping_rule
-from hbr.dense.index import POWER, DenseIndex
+from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
 from hbr.dense.pose import pose, poses_of
 from hbr.dense.session import DenseSession, answered, near
-from hbr.dense.stopping import Outcome, StoppingRule
+from hbr.dense.stopping import Outcome
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition, EvaluationImage, enrolled_levels, query_levels
 from hbr.evaluation.experiment import Experiment, Kind
@@ -121,10 +121,7 @@ def run_object(
     methods: Sequence[Method],
     protocol: Protocol,
     *,
-    rule: StoppingRule | None = None,
     photographs: LocalPhotographs | None = None,
-    same_bench: bool | None = None,
-    segmented_by: Sequence[str] = (),
     now_ns: Callable[[], int] = lambda: 0,
 ) -> Runs:
     """Search for one object with all methods, in all trials, and return the runs of this object.
@@ -141,15 +138,9 @@ def run_object(
         The methods of the search.
     protocol : Protocol
         The settings of the trials.
-    rule : StoppingRule, optional
-        The rule for methods of the dense filter; default: `rule_of_trial`.
     photographs : LocalPhotographs, optional
         The images, with which a search of the dense filter compares its two leaders as on the bench. Without them it
         keeps its answer.
-    same_bench : bool, optional
-        Whether a search of the dense filter knows that the bench is that of the enrollment; None: it does not know.
-    segmented_by : sequence of str, optional
-        How each query was segmented (`hbr.evaluation.condition.query_levels`).
     now_ns : callable
         Monotonic time, for `Runs.step_ns`.
 
@@ -158,9 +149,7 @@ def run_object(
     ValueError
         The object has too few views, or the number of queries is another one.
     """
-    if rule is None and any(method.dense for method in methods):
-        rule = rule_of_trial(views, protocol)
-    trial = _Trials(object_index, queries, views, protocol, rule, now_ns, photographs, same_bench, segmented_by)
+    trial = _Trials(object_index, queries, views, protocol, now_ns, photographs)
     runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
     for t in range(protocol.trials):
         draws = trial.draw(t)
@@ -177,24 +166,18 @@ class _Trials:
         queries: LevelArray,
         views: Views,
         protocol: Protocol,
-        rule: StoppingRule | None,
         now_ns: Callable[[], int],
         photographs: LocalPhotographs | None = None,
-        same_bench: bool | None = None,
-        segmented_by: Sequence[str] = (),
     ) -> None:
-        self._same_bench = same_bench
-        self._segmented_by = segmented_by or [""] * len(queries)
         self._photographs = photographs
         self._object, self._queries, self._views = object_index, queries, views
-        self._protocol, self._rule, self._now_ns = protocol, rule, now_ns
+        self._protocol, self._now_ns = protocol, now_ns
         self._rows = views.of(object_index)
         self._azimuth_deg = views.azimuth_deg[self._rows]
         name = views.object_names[object_index]
         self._enrolled = views_of_trial(views, protocol)
         self._is_unknown = name in protocol.absent
         self._free = np.flatnonzero(~self._enrolled[self._rows]) if protocol.enrolled else np.arange(len(self._rows))
-        self._index: DenseIndex | None = None
         if len(queries) != len(self._rows):
             raise ValueError(f"{len(queries)} queries for the {len(self._rows)} views of {name}; one each is needed")
         if len(self._free) <= protocol.max_views:
@@ -321,54 +304,47 @@ class _Trials:
         return int(draws.order[len(seen)])
 
     def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
-        assert self._rule is not None
-        if self._index is None or self._index.omega != method.omega:
-            self._index = DenseIndex(self._views.select(self._enrolled), omega=method.omega)
+        index = _index_of_trial(self._views, self._protocol, method.omega)
         last = self._last(method)
-        session = DenseSession(self._index, self._rule, max_views=last, most_changes=0)
+        session = DenseSession(index, max_views=last, most_changes=0)
         ended = False
         for n, seen, keep, measured in self._queries_of(draws, last, runs, at):
             # Views near the newest query leave the model for the earlier queries, too.
             gone = self._rows[~keep & self._enrolled[self._rows]]
             measured_deg = measured.tolist()
             if len(gone):
-                fewer = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
-                session = DenseSession(fewer, self._rule, max_views=last, most_changes=0)
+                fewer = index.without(np.cumsum(self._enrolled)[gone] - 1)
+                session = DenseSession(fewer, max_views=last, most_changes=0)
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
                     session.add(self._queries[i], angle_deg)
             start_ns = self._now_ns()
             newest = seen[-1]
-            decision = session.add(
-                self._queries[newest],
-                measured_deg[-1],
-                same_bench=self._same_bench,
-                segmented_by=self._segmented_by[newest],
-            )
+            session.add(self._queries[newest], measured_deg[-1])
             following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
             objects = ranking.object_index.tolist()
             pose_deg = [poses_of(session.belief, j)[0] if j == self._object else np.nan for j in objects]
             self._record(ranking.object_index, np.array(pose_deg), seen, runs, (*at, n))
-            # The numbers after this view; at the first end, also the last steps.
+            # The numbers after this view; until the first end, also its comparisons of pixels.
             runs.score[*at, n] = ranking.scores[0]
             runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
-            runs.outcome[*at, n] = OUTCOMES.index(decision.outcome)
-            if not ended and decision.outcome is not Outcome.CONTINUE:
+            if not ended:
+                runs.compared[*at, n] = self._compared(session, seen, measured_deg)
+            runs.outcome[*at, n] = OUTCOMES.index(session.decision.outcome)
+            if not ended and session.decision.outcome is not Outcome.CONTINUE:
                 ended = True
-                end, runs.compared[*at, n] = self._end(session, seen, measured_deg)
-                runs.outcome[*at, n] = OUTCOMES.index(end)
                 if self._object in objects:
                     stated = pose(session.belief, self._object)
                     enrolled_deg = self._azimuth_deg[keep]
                     runs.stated[*at, n] = stated_pose(stated, float(self._azimuth_deg[newest]), enrolled_deg)
             seen.append(following)
 
-    def _end(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> tuple[Outcome, int]:
-        """Take the last steps of a search as on the bench; return the outcome, and `Runs.compared`."""
+    def _compared(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> int:
+        """Compare pixels as on the bench: the leader's, and at the end those of two leaders; return `Runs.compared`."""
         photographs = self._photographs
         if photographs is None:
-            return session.decision.outcome, -1
+            return -1
         keep = self._keep(np.array(seen))
 
         def queries(n: int) -> list[LocalView]:
@@ -379,13 +355,13 @@ class _Trials:
             return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
 
         answered(session.verify(queries), enrolled)
-        before = session.end()
-        compared = answered(session.compare(queries), enrolled)
+        before = session.decision.outcome
+        compared = None if before is Outcome.CONTINUE else answered(session.compare(queries), enrolled)
         if compared is None:
-            return before.outcome, -1
+            return -1
         if compared.winner is not None:
-            return before.outcome, COMPARED.index("right" if compared.winner == self._object else "wrong")
-        return before.outcome, COMPARED.index("none" if compared.outcome is before.outcome else "ambiguous")
+            return COMPARED.index("right" if compared.winner == self._object else "wrong")
+        return COMPARED.index("none")
 
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
         match method.strategy:
@@ -485,9 +461,12 @@ class _Trials:
         runs.margin[at] = (ranking.scores[0] - reach.max()) / len(seen)
 
 
-def rule_of_trial(views: Views, protocol: Protocol) -> StoppingRule:
-    """Return the stopping rule, fitted to the views that are enrolled in all trials, as on a bench."""
-    return fit_stopping_rule(DenseIndex(views.select(views_of_trial(views, protocol)))).rule
+@lru_cache(maxsize=1)
+def _index_of_trial(views: Views, protocol: Protocol, omega: float) -> DenseIndex:
+    """Return the index of the views that are enrolled in all trials, which each process makes once."""
+    index = DenseIndex(views.select(views_of_trial(views, protocol)), omega=omega)
+    _ = index.vectors  # they are not computed in the measured time
+    return index
 
 
 def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
@@ -500,16 +479,17 @@ def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
     return found
 
 
-def most_informative_rotation(belief: Belief, *, beta: float = BETA) -> float:
+def most_informative_rotation(belief: Belief) -> float:
     """Choose the rotation whose view is expected to leave the least entropy: a baseline for `hbr.next_best_view`.
 
     If hypothesis h is true, the view after a rotation is the one that was enrolled there. The likelihood of hypothesis
-    h' is then exp(β T(view_h, view_h')^p). Arguments as for `hbr.next_best_view`.
+    h' is then exp(β z(view_h, view_h') / √n).
     """
-    probability, place, bin_of = strongest(belief.posterior(beta))
+    probability, place, bin_of = strongest(belief.posterior())
     rows, _ = expected_views(belief, place, bin_of, ALL_ROTATIONS_DEG)
-    similar = belief.index.compared.among(rows)
-    weights = probability * np.exp(beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** POWER - 1))
+    # z relative to that of equal views
+    z = belief.index.space.largest.sum() * (belief.index.among(rows) - 1)
+    weights = probability * np.exp(BETA / np.sqrt(belief.queries + 1) * z)
     weights /= weights.sum(axis=2, keepdims=True)
     objects = (place[:, None] == np.unique(place)).astype(np.float64)
     shares = weights @ objects
@@ -529,36 +509,19 @@ def all_views(experiment: Experiment, dataset: Dataset, enrolled: list[LevelArra
     return Views.concatenate([Views.of_object(item.name, own, item.azimuth_deg, kind) for item, own in objects])
 
 
-def _with_rule(
-    experiment: Experiment, dataset: Dataset, enrolled: list[LevelArray]
-) -> tuple[Views, StoppingRule | None]:
-    views = all_views(experiment, dataset, enrolled)
-    is_dense = any(method.dense for method in experiment.methods)
-    return views, rule_of_trial(views, experiment.protocol) if is_dense else None
-
-
-def _search(
-    experiment: Experiment,
-    dataset: Dataset,
-    model: tuple[Views, StoppingRule | None],
-    now_ns: Callable[[], int],
-    j: int,
-) -> Searched:
-    condition, protocol, (views, rule) = experiment.condition, experiment.protocol, model
+def _search(experiment: Experiment, dataset: Dataset, views: Views, now_ns: Callable[[], int], j: int) -> Searched:
+    condition, protocol = experiment.condition, experiment.protocol
     began_ns = now_ns()
     queries = query_levels(dataset, j, condition, protocol.seed)
-    describe_ns = (now_ns() - began_ns) / len(queries.levels)
+    describe_ns = (now_ns() - began_ns) / len(queries)
     photographs = LocalPhotographs(dataset, condition, protocol.seed)
     runs = run_object(
         j,
-        queries.levels,
+        queries,
         views,
         experiment.methods,
         protocol,
-        rule=rule,
         photographs=photographs if photographs.possible else None,
-        same_bench=condition.same_bench,
-        segmented_by=queries.methods,
         now_ns=now_ns,
     )
     return Searched(runs, describe_ns)
@@ -579,4 +542,4 @@ def _results(experiment: Experiment, dataset: Dataset, _model: object, found: li
     }
 
 
-TRIALS: Final = Kind(enroll, _with_rule, _search, _results)
+TRIALS: Final = Kind(enroll, all_views, _search, _results)

@@ -3,7 +3,6 @@
 import ctypes
 import threading
 from functools import lru_cache
-from itertools import pairwise
 from math import ceil, floor
 from typing import Any, Final, NamedTuple
 
@@ -11,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.kernels.library import THREADS, address, library, run
+from hbr.kernels.library import address, library, run
 
-_ROWS_OF_A_THREAD: Final = 100_000
-"""Smallest number of rows for a thread: fewer take less time than its start."""
 _MOST_ROWS: Final = 257
 """Largest number of bytes whose sum fits into 16 bits."""
 
@@ -119,184 +116,12 @@ def average(image: ImageArray, side: int) -> ImageArray | None:
     return out if is_done else None
 
 
-class _Measure(ctypes.Structure):
-    _fields_ = (
-        ("edges_at", ctypes.c_int64),
-        ("colours_at", ctypes.c_int64),
-        ("edges_share", ctypes.c_double),
-        ("colours_share", ctypes.c_double),
-        ("edge_values", ctypes.c_void_p),
-        ("colour_weights", ctypes.c_void_p),
-        ("far", ctypes.c_void_p),
-        ("near", ctypes.c_void_p),
-    )
-
-
-class Measure(NamedTuple):
-    """Settings of the comparison of packed rows of edges, colours, or both.
-
-    Attributes
-    ----------
-    edges_at, colours_at
-        First byte of each part in a row; -1 without it.
-    edges_share, colours_share
-        Weights of the two similarities, if there are both.
-    edge_values : int32 array (4,)
-        Value of each level of the edges.
-    colour_weights : int32 array (32,)
-        Weight of the squared difference of each level of the colours.
-    far, near : float64 arrays
-        Similarity of colours at distances 4096 i, and at distances i below 4096.
-    """
-
-    edges_at: int = -1
-    colours_at: int = -1
-    edges_share: float = 1.0
-    colours_share: float = 1.0
-    edge_values: NDArray[np.int32] = np.zeros(4, np.int32)
-    colour_weights: NDArray[np.int32] = np.zeros(32, np.int32)
-    far: FloatArray = np.ones(1)
-    near: FloatArray = np.ones(1)
-
-    def struct(self) -> ctypes.Structure:
-        """Return the struct that the kernels read; the arrays must live as long as it."""
-        return _Measure(*self[:4], *(address(array) for array in self[4:]))
-
-
-class _Segments(ctypes.Structure):
-    _fields_ = (
-        ("places", ctypes.c_void_p),
-        ("order", ctypes.c_void_p),
-        ("begin", ctypes.c_void_p),
-        ("count", ctypes.c_void_p),
-        ("objects", ctypes.c_int64),
-    )
-
-
 class Segments(NamedTuple):
     """The rows of each object, one object after the other: ``lengths`` of ``order`` from ``begin`` on; int64 arrays."""
 
     order: IndexArray
     begin: IndexArray
     lengths: IndexArray
-    is_whole: bool = False
-    """Whether ``order`` is 0, 1, 2, ..."""
-
-
-class PackedRows:
-    """Packed rows, prepared for the kernels.
-
-    Parameters
-    ----------
-    measure : Measure
-        How they are compared.
-    rows : uint8 array (n, bytes)
-        The bytes of a row lie side by side.
-    squares : float64 array (n,), optional
-        Squared lengths of their edges, if they are known.
-    places : integer array (m,), optional
-        Only these of the rows, in this order.
-    """
-
-    def __init__(
-        self, measure: Measure, rows: LevelArray, squares: FloatArray | None = None, places: IndexArray | None = None
-    ) -> None:
-        found = library()
-        assert found is not None
-        self._library, self._measure, self._struct = found, measure, measure.struct()
-        self._by_address = ctypes.addressof(self._struct)
-        self.rows = rows if rows.strides[1:] == (1,) else np.ascontiguousarray(rows)
-        self._at = address(self.rows), self.rows.strides[0]
-        self._places = places
-        if squares is None:
-            squares = np.zeros(len(rows))
-            if measure.edges_at >= 0:
-                found.hbr_squares(self._by_address, *self._at, len(rows), address(squares))
-        self.squares = squares
-
-    def __len__(self) -> int:
-        return len(self.rows) if self._places is None else len(self._places)
-
-    def similarity(self, queries: LevelArray) -> FloatArray:
-        """Return the similarity of packed queries, (n, bytes), to all rows, (n, m)."""
-        queries = np.ascontiguousarray(queries)
-        similar = np.empty((len(queries), len(self)))
-        places = 0 if self._places is None else address(self._places)
-        self._library.hbr_similarity(
-            self._by_address, address(queries), queries.strides[0], len(queries),
-            *self._at, address(self.squares), places, len(self), address(similar),
-        )  # fmt: skip
-        return similar
-
-    def pairs(self, rows: IndexArray, first: IndexArray, second: IndexArray) -> FloatArray:
-        """Return the similarity of two rows of each group, (g, p): indices (g, k), and which two of them, (p,) each.
-
-        Pairs with the same first one follow each other.
-        """
-        places = _whole(rows if self._places is None else self._places[rows])
-        first, second = _whole(first), _whole(second)
-        similar = np.empty((len(places), len(first)))
-        self._library.hbr_pairs(
-            self._by_address, *self._at, address(self.squares), address(places), *places.shape,
-            address(first), address(second), len(first), address(similar),
-        )  # fmt: skip
-        return similar
-
-    def among(self, rows: IndexArray) -> FloatArray:
-        """Return the similarity of rows to each other within groups, indices (g, k), as (g, k, k)."""
-        first, second = np.triu_indices(rows.shape[1])
-        similar = np.empty((*rows.shape, rows.shape[1]))
-        similar[:, first, second] = similar[:, second, first] = self.pairs(rows, first, second)
-        return similar
-
-    def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:
-        """Return an upper bound of the similarity of each object's rows to a packed query, (k,)."""
-        bounds = np.empty(len(segments.lengths))
-        threads = max(1, min(THREADS, len(self) // _ROWS_OF_A_THREAD))
-        limits = [len(bounds) * i // threads for i in range(threads + 1)]
-        parts = [(query, segments, bounds, *part) for part in pairwise(limits)]
-        others = [threading.Thread(target=self._store_bounds, args=part) for part in parts[1:]]
-        for thread in others:
-            thread.start()
-        self._store_bounds(*parts[0])
-        for thread in others:
-            thread.join()
-        return bounds
-
-    def _store_bounds(self, query: LevelArray, segments: Segments, bounds: FloatArray, first: int, last: int) -> None:
-        """Store the bounds of the objects from the first to the last; the interpreter is free meanwhile."""
-        some = segments._replace(begin=segments.begin[first:last], lengths=segments.lengths[first:last])
-        struct = self._segments(some)
-        self._library.hbr_bounds(
-            self._by_address,
-            address(query),
-            *self._at,
-            address(self.squares),
-            ctypes.addressof(struct),
-            address(bounds[first:last]),
-        )
-
-    def nearest(self, query: LevelArray, segments: Segments, kept: int) -> IndexArray:
-        """Return the objects with the most similar views, ascending (kept,); of equal ones, the first."""
-        bounds = self.bounds(query, segments)
-        by_bound = np.argsort(-bounds).astype(np.int64, copy=False)
-        nearest, similar = np.empty(kept, np.int64), np.empty(kept)
-        struct = self._segments(segments)
-        self._library.hbr_nearest(
-            self._by_address, address(query), *self._at, address(self.squares), ctypes.addressof(struct),
-            address(by_bound), address(bounds), kept, address(nearest), address(similar),
-        )  # fmt: skip
-        return np.sort(nearest)
-
-    def _segments(self, segments: Segments) -> ctypes.Structure:
-        places = 0 if self._places is None else address(self._places)
-        order = 0 if segments.is_whole else address(segments.order)
-        return _Segments(places, order, address(segments.begin), address(segments.lengths), len(segments.lengths))
-
-    def only(self, rows: IndexArray) -> "PackedRows":
-        """Return some of the rows, in this order; nothing is copied."""
-        places = np.ascontiguousarray(rows if self._places is None else self._places[rows], np.int64)
-        return PackedRows(self._measure, self.rows, self.squares, places)
 
 
 class ByteRows:
@@ -360,7 +185,7 @@ def support(
     scratch = np.empty(4 * room)
     added = np.empty((len(segments.lengths), 72), np.float32)
     of_bins = slope, part_deg, whole, scratch, room, added
-    is_done = run("hbr_support", *segments[:3], len(segments.lengths), azimuth_deg, levels, *of_bins)
+    is_done = run("hbr_support", *segments, len(segments.lengths), azimuth_deg, levels, *of_bins)
     return added if is_done else None
 
 
@@ -371,7 +196,7 @@ def nearest_view(
     places, at_deg = _whole(places), np.ascontiguousarray(at_deg)
     rows, away_deg = np.empty(at_deg.shape, np.int64), np.empty(at_deg.shape)
     asked = places, len(places), at_deg, len(at_deg)
-    is_done = run("hbr_nearest_view", *segments[:3], azimuth_deg, *asked, rows, away_deg)
+    is_done = run("hbr_nearest_view", *segments, azimuth_deg, *asked, rows, away_deg)
     return (rows, away_deg) if is_done else None
 
 

@@ -18,15 +18,6 @@ SWITCH: Final = "HBR_KERNELS"
 _POINTER, _INTEGER, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_cedd": (_POINTER, *[_INTEGER] * 5, _POINTER, _POINTER, _POINTER),
-    "hbr_squares": (_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),
-    "hbr_similarity": (
-        *[_POINTER] * 2, _INTEGER, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _POINTER,
-    ),
-    "hbr_pairs": (
-        _POINTER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER, _INTEGER, _POINTER,
-    ),
-    "hbr_bounds": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 3),
-    "hbr_nearest": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 4, _INTEGER, _POINTER, _POINTER),
     "hbr_byte_squares": (_POINTER, *[_INTEGER] * 3, _POINTER),
     "hbr_tanimoto": (_POINTER, _INTEGER, _INTEGER, _POINTER, _INTEGER, _POINTER, _INTEGER, _INTEGER, _POINTER),
     "hbr_tanimoto_top": (_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),

@@ -51,7 +51,6 @@ def test_views_of_a_twin_are_recognised_by_its_sticker(objects, sticker: bool) -
     assert found.winner == int(sticker)
     assert found.score * (-1 if sticker else 1) > 0.6
     assert found.error_bound <= 0.01
-    assert found.twins
     assert found.fits
     y, x = np.unravel_index(int(found.views[0].difference.argmax()), found.views[0].difference.shape)
     away = (abs(x / 0.8 - 82.5), abs(y / 0.8 - 78.5))  # from the middle; the sticker is 14 px wide and 14 degrees aside
@@ -82,7 +81,6 @@ def test_comparison_decides_nothing_if_twins_look_the_same(objects) -> None:
     found = compare_objects([shown(4.0, sticker=False, noise=91)], (plain, plain[::-1]), ([0.0], [0.0]))
     assert found.winner is None
     assert found.expected is None
-    assert found.twins
     assert found.fits
 
 
@@ -109,8 +107,8 @@ def test_last_views_that_are_far_apart_are_compared() -> None:
 
 def test_a_symmetric_object_has_several_poses() -> None:
     rng = np.random.default_rng(0)
-    kind = hbr.descriptor("edges+colours")
-    half = rng.integers(0, 4, (9, kind.length)).astype(np.uint8)
+    kind = hbr.descriptor("edges")
+    half = rng.integers(0, 2, (9, kind.length)).astype(np.uint8)
     rows = np.concatenate([half, half])
     index = hbr.DenseIndex(hbr.Views.of_object("twice", rows, np.arange(18) * 20.0, kind.name))
     belief = hbr.update_belief(rows[3], 0.0, index)

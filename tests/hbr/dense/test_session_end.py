@@ -9,10 +9,11 @@ import pytest
 import hbr
 from hbr import Outcome, StopReason
 from hbr.dense.arc import ArcSession
-from hbr.dense.local_difference import LocalView
+from hbr.dense.local_difference import LocalView, PixelFit
 from hbr.dense.session import NeedEnrolledViews, Verification, answered, compare_leaders
+from hbr.dense.stopping import ERROR_RATE, decide
+from tests.hbr.dense.searches import catalog, found_from
 from tests.hbr.dense.test_local_difference import shown
-from tests.hbr.dense.test_stopping import catalog
 
 SIDES_DEG = np.arange(0.0, 360.0, 10.0).tolist()
 
@@ -28,11 +29,9 @@ def session() -> hbr.DenseSession:
     """A search for one of two near twins, which have the same descriptors, after its last view."""
     others = catalog(objects=4)
     own = others.of(0)
-    twin = hbr.Views.of_object("twin", others.levels(own), others.azimuth_deg[own])
+    twin = hbr.Views.of_object("twin", others.levels(own), others.azimuth_deg[own], others.descriptor)
     index = hbr.DenseIndex(hbr.Views.concatenate([others, twin]))
-    rule = hbr.fit_stopping_rule(hbr.DenseIndex(others)).rule
-    usual = np.vstack([rule.usual_scores, rule.usual_scores[:1]])
-    session = hbr.DenseSession(index, replace(rule, usual_scores=usual), max_views=1)
+    session = hbr.DenseSession(index, max_views=1)
     session.add(others.levels(own[:1])[0], 0.0)
     assert session.end().outcome in (Outcome.AMBIGUOUS, Outcome.UNKNOWN)
     return session
@@ -57,36 +56,26 @@ def test_the_views_that_the_search_asks_for_distinguish_near_twins(session, enro
         4 if sticker else 0,
     )
     assert end.probability == 1 - found.found.error_bound
-    assert end.min_confidence == 1 - session.rule.error_rate
-    assert end.open_set_score == before.open_set_score
-    session.add(session.belief.levels[0], 0.0)
+    assert end.min_confidence == 1 - ERROR_RATE
+    assert end.not_enrolled == before.not_enrolled
+    session.add(session.belief.index.views.levels(np.array([0]))[0], 0.0)
     assert session.comparison is None
     assert session.end().reason is not StopReason.LOCAL_DIFFERENCE
 
 
-@pytest.mark.parametrize(
-    ("before", "are_twins", "is_enrolled", "after"),
-    [
-        (Outcome.AMBIGUOUS, True, True, Outcome.FOUND),
-        (Outcome.AMBIGUOUS, False, True, Outcome.FOUND),
-        (Outcome.AMBIGUOUS, True, False, Outcome.AMBIGUOUS),
-        (Outcome.UNKNOWN, True, True, Outcome.FOUND),
-        (Outcome.UNKNOWN, False, True, Outcome.UNKNOWN),
-        (Outcome.UNKNOWN, True, False, Outcome.UNKNOWN),
-    ],
-)
-def test_a_comparison_decides_an_unknown_search_only_for_an_object_that_fits_one_of_two_twins(
-    session, enrolled, before: Outcome, are_twins: bool, is_enrolled: bool, after: Outcome
-) -> None:
+@pytest.mark.parametrize(("is_enrolled", "winner"), [(True, 0), (False, None)])
+def test_an_ambiguous_search_compares_its_leaders(session, enrolled, is_enrolled: bool, winner: int | None) -> None:
     plain, marked = enrolled
-    second = marked if are_twins else [recoloured(view) for view in plain]
     query = shown(4.0, sticker=False, noise=90)
-    step = compare_leaders(
-        session.belief, before, lambda _: [query if is_enrolled else recoloured(query)], beta=60.0, max_error=0.01
-    )
-    found = answered(step, lambda leader, _: second if leader == 4 else plain)
+    step = compare_leaders(session.belief, Outcome.AMBIGUOUS, lambda _: [query if is_enrolled else recoloured(query)])
+    found = answered(step, lambda leader, _: marked if leader == 4 else plain)
     assert found is not None
-    assert (found.outcome, found.winner) == (after, 0 if after is Outcome.FOUND else None)
+    assert found.winner == winner
+
+
+def test_an_unknown_search_compares_nothing(session) -> None:
+    step = compare_leaders(session.belief, Outcome.UNKNOWN, lambda _: pytest.fail("no view is needed"))
+    assert answered(step) is None
 
 
 def recoloured(view: LocalView) -> LocalView:
@@ -102,21 +91,43 @@ def test_without_enrolled_views_the_decision_stays(session) -> None:
         step.send(None)
     assert end.value.value is None
     assert session.end() == before
-    assert answered(session.verify(lambda _: pytest.fail("it is not doubtful"))) is None
 
 
-def test_a_doubtful_search_in_motion_is_not_verified(session, monkeypatch) -> None:
-    monkeypatch.setattr("hbr.dense.session.is_doubtful", lambda *_: True)
+def test_a_search_at_rest_is_verified_unless_its_object_is_hardly_enrolled(session) -> None:
+    views = session.belief.index.views
     need = next(session.verify(lambda _: pytest.fail("first it asks")))
     assert need.object_index == session.end().object_index
-    moving = ArcSession(session.belief.index, session.rule, 2.0)
-    moving.add(session.belief.levels[0], 0.0)
-    assert answered(moving.verify(lambda _: pytest.fail("no view is needed"))) is None
-    assert moving.verification is None
+    moving = ArcSession(session.belief.index)
+    moving.add(views.levels(np.array([0]))[0], 0.0)
+    unknown = hbr.DenseSession(session.belief.index)
+    for n in range(4):
+        unknown.add(catalog(1, seed=9).levels(np.array([4 * n]))[0], 80.0 * n)
+    assert unknown.end().outcome is Outcome.UNKNOWN
+    for one in (moving, unknown):
+        before = one.end()
+        assert answered(one.verify(lambda _: pytest.fail("no view is needed"))) is None
+        assert (one.verification, one.end()) == (None, before)
 
 
 def test_a_measured_fit_replaces_the_enrolled_views(session) -> None:
-    before = session.end()
-    assert answered(session.verify(lambda _: pytest.fail("no view is needed"), Verification(0, 0.0, 0.0))) is not None
-    assert session.end() == session.verification.decided(before, session.found_from)
-    assert session.end().reason is StopReason.PIXEL_FIT
+    found = []
+    for own in (0.1, 0.5, 0.9):
+        measured = Verification(session.end().object_index, PixelFit(own, 0.3, 0.8))
+        assert answered(session.verify(lambda _: pytest.fail("no view is needed"), measured)) is measured
+        assert session.decision == session.present == decide(session.belief, last=True, fit=measured.fit)
+        found.append(session.end().not_enrolled)
+    assert found == sorted(found, reverse=True)
+    session.add(session.belief.index.views.levels(np.array([0]))[0], 0.0)
+    assert session.verification is None
+
+
+def test_a_good_fit_ends_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    index = hbr.DenseIndex(catalog(objects=4))
+    session = hbr.DenseSession(index)
+    session.add(index.views.levels(np.array([0]))[0], 0.0)
+    with_fit = decide(session.belief, last=False, fit=PixelFit(0.95, 0.2, 0.9)).probability
+    found_from(monkeypatch, with_fit)
+    session = hbr.DenseSession(index)
+    assert session.add(index.views.levels(np.array([0]))[0], 0.0).outcome is Outcome.CONTINUE
+    answered(session.verify(lambda _: [], Verification(0, PixelFit(0.95, 0.2, 0.9))))
+    assert session.decision.outcome is session.end().outcome is Outcome.FOUND

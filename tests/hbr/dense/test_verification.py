@@ -1,29 +1,17 @@
-"""A doubtful leader is found if its enrolled views explain the pixels of the views in any light."""
+"""A doubtful leader is compared with the views of the search: its enrolled views explain their pixels in any light."""
 
 from dataclasses import replace
-from math import inf
 
 import cv2
 import numpy as np
 import pytest
 
-from hbr import Belief, DenseIndex, DenseSession, Outcome, StopDecision, StopReason, Views, update_belief
+from hbr import Belief, DenseIndex, Views, update_belief
 from hbr.core.angles import wrap180
-from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.local_difference import LocalView, Pixels, fit
-from hbr.dense.session import (
-    FOUND_FROM,
-    FOUND_FROM_SAME_BENCH,
-    UNKNOWN_BELOW,
-    Verification,
-    answered,
-    is_doubtful,
-    verify,
-)
-from hbr.dense.stopping import StoppingRule, fitted_before
-from tests.hbr.dense.test_stopping import catalog
+from hbr.dense.session import answered, verify
+from tests.hbr.dense.searches import catalog
 
-KIND = "edges+colours"
 SIDE = 160
 
 
@@ -78,75 +66,9 @@ def test_nothing_is_explained_without_common_pixels() -> None:
     assert fit(Pixels.of(view), Pixels.of(nothing)) == 0
 
 
-def decision(score: float, *, confidence: float = 0.99, outcome: Outcome = Outcome.UNKNOWN) -> StopDecision:
-    return StopDecision(outcome, StopReason.CONFIDENT, 0, confidence, 0.95, score, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("fitted", "confidence", "outcome"),
-    [
-        (0.8, 0.99, Outcome.FOUND),
-        (0.8, 0.5, Outcome.AMBIGUOUS),
-        (0.4, 0.99, Outcome.AMBIGUOUS),
-        (0.2, 0.99, Outcome.UNKNOWN),
-    ],
-)
-def test_outcome_follows_from_fit_and_open_set_score(fitted: float, confidence: float, outcome: Outcome) -> None:
-    found = Verification(0, fitted, 0.1)
-    decided = found.decided(decision(0.0, confidence=confidence))
-    assert (decided.outcome, decided.reason) == (outcome, StopReason.PIXEL_FIT)
-    assert found.score(1.0) > found.score(0.0)
-    assert Verification(0, fitted, 0.2).score(0.0) < found.score(0.0)
-    assert FOUND_FROM > UNKNOWN_BELOW
-
-
-@pytest.mark.parametrize("fitted", [0.5, 0.8])
-def test_object_on_a_bench_that_may_be_unchanged_needs_a_better_fit(
-    index: DenseIndex, rule: StoppingRule, fitted: float
-) -> None:
-    for same_bench, least in ((True, FOUND_FROM_SAME_BENCH), (None, FOUND_FROM_SAME_BENCH), (False, FOUND_FROM)):
-        session = DenseSession(index, rule)
-        session.add(index.views.descriptors[0], 0.0, same_bench=same_bench)
-        assert session.found_from == least
-    assert FOUND_FROM_SAME_BENCH > FOUND_FROM
-    found = Verification(0, fitted, fitted - 0.2)
-    assert found.decided(decision(0.0)).outcome is Outcome.FOUND
-    strict = found.decided(decision(0.0), FOUND_FROM_SAME_BENCH).outcome
-    assert strict is (Outcome.FOUND if fitted == 0.8 else Outcome.AMBIGUOUS)
-
-
 @pytest.fixture(scope="module")
 def index() -> DenseIndex:
     return DenseIndex(catalog())
-
-
-@pytest.fixture(scope="module")
-def rule(index: DenseIndex) -> StoppingRule:
-    plain = fit_stopping_rule(index).rule
-    return replace(plain, open_set=fitted_before(KIND, 4), open_set_thresholds=(3.0, 3.0, 3.0, -1.0))
-
-
-@pytest.mark.parametrize(
-    ("score", "views", "outcome", "doubtful"),
-    [
-        (0.0, 4, Outcome.UNKNOWN, True),
-        (0.0, 4, Outcome.FOUND, True),
-        (0.0, 3, Outcome.UNKNOWN, False),
-        (0.0, 4, Outcome.CONTINUE, False),
-        (3.0, 4, Outcome.FOUND, False),
-        (-7.5, 4, Outcome.UNKNOWN, False),
-        (-inf, 4, Outcome.UNKNOWN, False),
-    ],
-)
-def test_search_that_ends_between_two_scores_is_doubtful(
-    rule: StoppingRule, score: float, views: int, outcome: Outcome, doubtful: bool
-) -> None:
-    assert is_doubtful(rule, decision(score, outcome=outcome), views, KIND) is doubtful
-    assert not is_doubtful(replace(rule, open_set=None), decision(score, outcome=outcome), views, KIND)
-    sure = replace(decision(score, outcome=Outcome.FOUND), reason=StopReason.UNCHANGED_BENCH)
-    assert not is_doubtful(rule, sure, views, KIND)
-    other = replace(rule.open_set, weights=rule.open_set.weights + 1)  # type: ignore[type-var, union-attr]
-    assert not is_doubtful(replace(rule, open_set=other), decision(score, outcome=outcome), views, KIND)
 
 
 def test_the_leader_is_compared_at_its_pose_with_the_better_segmentation(index: DenseIndex) -> None:
@@ -163,9 +85,10 @@ def test_the_leader_is_compared_at_its_pose_with_the_better_segmentation(index: 
         asked[leader] = list(azimuths_deg)
         return [replace(painted(leader), azimuth_deg=azimuth_deg) for azimuth_deg in azimuths_deg]
 
-    found = answered(verify(so_far, 2, lambda _: [painted(9), painted(2)]), enrolled)
+    found = answered(verify(so_far, lambda _: [painted(9), painted(2)]), enrolled)
     assert found is not None
-    assert len(asked) == 4
+    assert len(asked) == 2  # the leader and the next candidate
     assert np.allclose(wrap180(asked[2] - views.azimuth_deg[rows]), 0, atol=15)
     assert found.object_index == 2
-    assert found.fit > 0.4 > found.others
+    assert found.fit.own > 0.4 > found.fit.others
+    assert found.fit.expected == pytest.approx(1, abs=0.05)  # all views of the object are the same here

@@ -2,9 +2,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from hbr import ViewIndex, Views
-from hbr.descriptors import Descriptor, descriptor, names
+from hbr import ViewIndex, Views, segment
+from hbr.descriptors import Descriptor, best, descriptor, names, network
+from hbr.descriptors.edges_and_colours import _histogram
+from hbr.descriptors.registry import FULL, LIGHT
+from hbr.kernels import without_library
+from tests.fuzzing import examples
 
 #: Those whose packages are installed.
 NAMES = [name for name in names() if descriptor(name).can_describe]
@@ -15,14 +21,14 @@ def one(request: pytest.FixtureRequest) -> Descriptor:
     return descriptor(request.param)
 
 
-def photo(seed: int = 0) -> np.ndarray:
+def photo(seed: int = 0, stripe_px: int = 6) -> np.ndarray:
     """Return an image of a coloured, striped blob before a dark background."""
     rng = np.random.default_rng(seed)
     image = np.full((120, 160, 3), 20, np.uint8)
     y, x = np.indices((120, 160))
     inside = ((y - 60) / 40) ** 2 + ((x - 80) / 30) ** 2 < 1
     image[inside] = rng.integers(60, 255, 3)
-    image[inside & (x // 6 % 2 == 0)] = rng.integers(60, 255, 3)
+    image[inside & (x // stripe_px % 2 == 0)] = rng.integers(60, 255, 3)
     return image
 
 
@@ -40,7 +46,7 @@ def test_attributes_fit_the_levels_and_unpack_restores_packed_levels(one: Descri
 
 
 def test_similarity_is_1_to_itself_symmetric_and_between_0_and_1(one: Descriptor) -> None:
-    rows = np.stack([one.describe(photo(seed)) for seed in range(6)])
+    rows = np.stack([one.describe(photo(seed, 6 + 3 * seed)) for seed in range(6)])
     similar = one.similarity(rows, rows)
     assert similar.shape == (6, 6)
     np.testing.assert_allclose(np.diag(similar), 1, atol=1e-6)
@@ -49,6 +55,32 @@ def test_similarity_is_1_to_itself_symmetric_and_between_0_and_1(one: Descriptor
     assert (similar <= 1 + 1e-12).all()
     assert similar[~np.eye(6, dtype=bool)].max() < 0.999
     np.testing.assert_allclose(one.similarity(rows[:2], rows), similar[:2], atol=1e-6)
+
+
+def test_packed_rows_are_compared_as_their_levels(one: Descriptor) -> None:
+    images = [*map(photo, range(5)), np.full((120, 160, 3), 90, np.uint8)]
+    rows = np.stack([one.describe(image) for image in images])
+    packed = np.pad(one.pack_rows(rows), ((0, 0), (3, 8)))[:, 3:-8]  # rows that do not lie side by side
+    groups = np.array([[0, 1, 5], [3, 3, 2]])
+    expected = one.similarity(rows, rows)
+    for found in (one.prepared(rows), one.opened(packed)):
+        for count in (0, 1, 6):
+            np.testing.assert_allclose(found.similarity(rows[:count]), expected[:count], atol=1e-6)
+        for similar, group in zip(found.among(groups), groups, strict=True):
+            np.testing.assert_allclose(similar, expected[np.ix_(group, group)], atol=1e-6)
+    assert one.opened(packed[:0]).similarity(rows).shape == (6, 0)
+    with pytest.raises(ValueError, match="packed rows of shape"):
+        one.opened(packed[:, :-1])
+
+
+@pytest.mark.parametrize("name", ["cedd", "cedd-rotated", LIGHT])
+def test_comparison_has_the_same_bits_without_kernels(name: str) -> None:
+    kind, rows = descriptor(name), np.stack([descriptor(name).describe(photo(seed)) for seed in range(9)])
+    packed = kind.pack_rows(rows)
+    for count in (1, 9):
+        with without_library():
+            expected = kind.opened(packed).similarity(rows[:count])
+        np.testing.assert_array_equal(kind.opened(packed).similarity(rows[:count]), expected)
 
 
 def test_name_of_a_descriptor_is_checked_and_opens_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +110,7 @@ def test_views_of_different_descriptors_cannot_be_mixed() -> None:
         ViewIndex(views[1], "tree")
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("cedd")])
+@pytest.mark.parametrize("name", [name for name in NAMES if "cedd" not in name])
 @pytest.mark.parametrize(("gain", "exponent"), [(0.6, 1.0), (1.25, 1.0), (1.0, 1.2)])
 def test_exposure_and_gamma_hardly_change_descriptors_of_the_object(name: str, gain: float, exponent: float) -> None:
     own = descriptor(name)
@@ -100,13 +132,79 @@ def test_unpack_rows_equals_unpack_of_each_row(name: str) -> None:
         kind.unpack_rows(packed[0][1:])
 
 
+@examples(20)
+@given(st.integers(0, 5), st.integers(0, 3000), st.floats(0, 1), st.integers(0, 2**32 - 1))
+def test_packed_edges_are_compared_by_the_cosine_of_their_bits(
+    queries: int, count: int, share: float, seed: int
+) -> None:
+    kind, rng = descriptor("edges"), np.random.default_rng(seed)
+    asked, rows = ((rng.random((n, 512)) < share * rng.random((n, 1))).astype(np.uint8) for n in (queries, count))
+    rows[: count // 5] = 0
+    assert kind.size_bytes == 64
+    packed = kind.pack_rows(rows)
+    np.testing.assert_array_equal(kind.unpack_rows(packed.tobytes()), rows)
+    similar = kind.opened(packed).similarity(asked)
+    units = [kind.entries(one) for one in (asked, rows)]
+    np.testing.assert_allclose(similar, units[0] @ units[1].T, atol=1e-12)
+    assert ((similar >= 0) & (similar <= 1)).all()
+    assert not similar[:, : count // 5].any()
+    for one, unit in zip((asked, rows), units, strict=True):
+        np.testing.assert_allclose(np.sqrt((unit * unit).sum(axis=1)), one.any(axis=1), atol=1e-12)
+
+
+def test_edges_are_bits_of_the_strong_entries() -> None:
+    for seed in range(5):
+        seen = segment(photo(seed))
+        levels = descriptor("edges").describe(seen)
+        np.testing.assert_array_equal(levels, _histogram(seen.alone) > 0.16175)
+        assert 8 < levels.sum() < 128
+    with pytest.raises(ValueError, match=r"edges has levels 0\.\.1"):
+        descriptor("edges").pack(levels + levels)
+
+
+def test_an_object_without_edges_is_not_similar_to_any() -> None:
+    kind = descriptor("edges")
+    rows = np.stack([kind.describe(np.full((120, 160, 3), 90, np.uint8)), kind.describe(photo())])
+    np.testing.assert_allclose(kind.similarity(rows, rows), [[0, 0], [0, 1]])
+
+
+@pytest.mark.parametrize("spread", [1, 20, 300])
+def test_colours_are_compared_by_a_gaussian_kernel(spread: int) -> None:
+    kind, rng = descriptor("colours"), np.random.default_rng(0)
+    rows = np.clip(128 + rng.normal(0, spread, (200, 32)), 0, 255).astype(np.uint8)
+    apart = (rows[:, None].astype(float) - rows) * np.repeat([0.04, 0.03, 0.03], (12, 10, 10))
+    expected = np.exp(-(apart * apart).sum(axis=2) / (2 * 2.5**2))
+    np.testing.assert_allclose(kind.similarity(rows, rows), expected, rtol=1e-9)
+
+
+def test_light_descriptor_joins_edges_colours_and_cedd_of_one_segmentation() -> None:
+    kind, weights = descriptor(LIGHT), {"edges": 0.36, "colours": 0.36, "cedd": 0.28}
+    assert (kind.size_bytes, kind.length, kind.whole_image) == (150, 688, False)
+    seen = [segment(photo(seed)) for seed in range(4)]
+    rows = np.stack([kind.describe(one) for one in seen])
+    parts = {name: np.stack([descriptor(name).describe(one) for one in seen]) for name in weights}
+    np.testing.assert_array_equal(rows, np.concatenate(list(parts.values()), axis=1))
+    np.testing.assert_array_equal(rows[0], kind.describe(photo(0)))
+    assert parts["cedd"].tolist() == [descriptor("cedd").describe(one.alone).tolist() for one in seen]
+    expected = sum(weights[name] * descriptor(name).similarity(own, own) for name, own in parts.items())
+    np.testing.assert_allclose(kind.similarity(rows, rows), expected, atol=1e-12)
+
+
+def test_best_descriptor_uses_the_network_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network, "weights_file", lambda: Path("weights"))
+    assert best() == FULL
+    assert descriptor(FULL).size_bytes == 406
+    monkeypatch.setattr(network, "weights_file", lambda: None)
+    assert best() == LIGHT
+
+
 def test_one_descriptor_with_weight_1_is_that_descriptor() -> None:
     assert descriptor("cedd=1") is descriptor("cedd")
 
 
 def test_descriptors_with_weights_describe_a_view_as_each_does_alone() -> None:
-    both = descriptor("cedd=0.25,edges+colours=0.75")
-    parts = [descriptor(name) for name in ("cedd", "edges+colours")]
+    both = descriptor("cedd=0.25,edges+colours+cedd=0.75")
+    parts = [descriptor(name) for name in ("cedd", "edges+colours+cedd")]
     images = [photo(seed) for seed in range(4)]
     rows = np.stack([both.describe(image) for image in images])
     own = [np.stack([part.describe(image) for image in images]) for part in parts]

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.nets import SharedNet
 from hbr.descriptors import descriptor, network
-from hbr.descriptors.base import Shift
 from hbr.descriptors.network import Block, graph, tensors
 
 installed = pytest.mark.skipif(not descriptor("network").can_describe, reason="pip install 'hbr-rig[network]'")
@@ -177,17 +176,6 @@ def test_other_weights_are_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     monkeypatch.setattr(network, "weights_file", lambda: tmp_path / "other.pth")
     with pytest.raises(ValueError, match="other weights than expected"):
         network._onnx.__wrapped__()
-
-
-def test_a_hard_change_leaves_half_of_the_cosine_and_no_change_leaves_all() -> None:
-    kind, rng = descriptor("network"), np.random.default_rng(6)
-    levels = network.to_levels(rng.normal(0, 1, 256).astype(np.float32))
-    np.testing.assert_array_equal(kind.shifted(levels, Shift.drawn(rng, 0.0)), levels)
-    hard = np.stack([kind.shifted(levels, Shift.drawn(rng, 1.0, bench=n // 4)) for n in range(80)])
-    cosine = kind.similarity(hard, levels[None])[:, 0] ** 2
-    assert 0.5 < np.median(cosine) < 0.7  # of drawn benches 0.63
-    among = kind.similarity(hard, hard) ** 2
-    assert np.median(among[::4, 1::4].diagonal()) > 0.8 > np.median(among[:4, 4:])  # a search stays on its bench
 
 
 def test_segmentations_of_a_frame_share_one_run(monkeypatch: pytest.MonkeyPatch) -> None:

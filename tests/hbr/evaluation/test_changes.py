@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import hbr
 from hbr.evaluation.changes import SearchResult, intervals, is_enrolled, summary
@@ -45,6 +46,30 @@ def test_answers_of_the_comparison_count_as_decided() -> None:
     found = summary(known, {})
     assert (found["compared"], found["decided_right"], found["decided_wrong"]) == (0.75, 0.5, 0.25)
     assert (found["right_by_comparison"], found["wrong_by_comparison"]) == (0.25, 0.25)
+
+
+def test_stated_probabilities_are_compared_with_the_shares_of_right_answers() -> None:
+    right, wrong = result("a", hbr.Outcome.FOUND), result("b", hbr.Outcome.FOUND)
+    known = {
+        "a": [
+            replace(right, probability=0.99, not_enrolled=0.01),
+            replace(wrong, probability=0.95, not_enrolled=0.03),
+            replace(result("a", hbr.Outcome.UNKNOWN), probability=0.1, not_enrolled=0.9),
+        ]
+    }
+    with_left_out = [
+        replace(one, left_out=outcome, left_out_probability=0.97, left_out_not_enrolled=not_enrolled)
+        for one, outcome, not_enrolled in zip(
+            known["a"], (hbr.Outcome.FOUND, hbr.Outcome.UNKNOWN, hbr.Outcome.AMBIGUOUS), (0.03, 0.9, 0.6), strict=True
+        )
+    ]
+    found = summary({"a": with_left_out}, {})
+    assert (found["accepted_searches"], found["accepted_right"]) == (3, pytest.approx(1 / 3))
+    assert found["accepted_stated"] == pytest.approx(0.97)
+    assert found["enrolled_not_enrolled"] == pytest.approx(0.94 / 3)
+    assert found["left_out_not_enrolled"] == pytest.approx(0.51)
+    nothing = summary(known | {"a": known["a"][2:]}, {})
+    assert (nothing["accepted_stated"], nothing["left_out_not_enrolled"]) == (None, None)
 
 
 def test_every_ninth_object_is_never_enrolled() -> None:

@@ -162,7 +162,7 @@ def test_cut_out_object_is_described_before_an_even_grey() -> None:
     [
         ({"background": "bench", "enrolled_background": "uniform"}, "leave enrolled_background out"),
         ({"enrolled_background": "striped"}, "use one of same, uniform, textured"),
-        ({"descriptor": "edges+colours", "cut_out": True}, "leave cut_out out"),
+        ({"descriptor": "edges+colours+cedd", "cut_out": True}, "leave cut_out out"),
     ],
 )
 def test_conditions_that_exclude_each_other_are_rejected(keys: dict[str, object], words: str) -> None:

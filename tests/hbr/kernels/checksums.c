@@ -4,20 +4,8 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-struct measure {
-    int64_t edges_at, colours_at;
-    double edges_share, colours_share;
-    const int32_t *edge_values, *colour_weights;
-    const double *far, *near;
-};
-
-void hbr_squares(const struct measure *, const uint8_t *, int64_t, int64_t, double *);
-void hbr_similarity(const struct measure *, const uint8_t *, int64_t, int64_t, const uint8_t *, int64_t, const double *,
-                    const int64_t *, int64_t, double *);
 void hbr_support(const int64_t *, const int64_t *, const int64_t *, int64_t, const double *, const float *, double,
                  double, int64_t, double *, int64_t, float *);
-void hbr_pairs(const struct measure *, const uint8_t *, int64_t, const double *, const int64_t *, int64_t, int64_t,
-               const int64_t *, const int64_t *, int64_t, double *);
 void hbr_nearest_view(const int64_t *, const int64_t *, const int64_t *, const double *, const int64_t *, int64_t,
                       const double *, int64_t, int64_t *, double *);
 void hbr_paths(const uint8_t *, int64_t, int64_t, int64_t, const uint8_t *, int64_t, const int64_t *, const double *,
@@ -36,24 +24,6 @@ static uint64_t random_bits(void) {
 
 static void add(const void *data, size_t size) {
     for (const uint8_t *byte = data; size--; byte++) sum = (sum ^ *byte) * 1099511628211ULL;
-}
-
-static uint8_t packed[300 * 160];
-static double squares[300], similar[3 * 300];
-static struct measure measure = {0, 128, .6, .4, 0, 0, 0, 0};
-
-static void similarity(void) {
-    static int32_t values[4] = {114, 1062, 2173, 3713}, weights[32];
-    static double far[6000], near[4096];
-    for (size_t i = 0; i < sizeof packed; i++) packed[i] = (uint8_t)(random_bits() >> 20);
-    for (int i = 0; i < 32; i++) weights[i] = i < 12 ? 16 : 9;
-    for (int i = 0; i < 6000; i++) far[i] = 1.0 / (1 + i * .3);
-    for (int i = 0; i < 4096; i++) near[i] = 1 - 1e-5 * i;
-    measure = (struct measure){0, 128, .6, .4, values, weights, far, near};
-    hbr_squares(&measure, packed, 160, 300, squares);
-    hbr_similarity(&measure, packed, 160, 3, packed, 160, squares, 0, 300, similar);
-    add(squares, sizeof squares);
-    add(similar, sizeof similar);
 }
 
 static void support(void) {
@@ -83,10 +53,6 @@ static void next_view(void) {
     }
     for (int i = 0; i < 6; i++) places[i] = random_bits() % 10;
     for (int i = 0; i < 60; i++) at_deg[i] = (double)(random_bits() % 200000) * .01 - 1000;
-    static const int64_t groups[2][4] = {{7, 299, 0, 12}, {5, 5, 80, 1}}, first[5] = {0, 0, 1, 3, 2};
-    static const int64_t second[5] = {1, 3, 2, 0, 3};
-    hbr_pairs(&measure, packed, 160, squares, groups[0], 2, 4, first, second, 5, similar);
-    add(similar, 10 * sizeof *similar);
     hbr_nearest_view(order, begin, count, azimuth_deg, places, 6, at_deg, 10, rows, away_deg);
     add(rows, sizeof rows);
     add(away_deg, sizeof away_deg);
@@ -137,8 +103,6 @@ static void cedd(void) {
 }
 
 int main(void) {
-    similarity();
-    printf("similarity %016llx\n", (unsigned long long)sum);
     support();
     printf("support %016llx\n", (unsigned long long)sum);
     cedd();

@@ -1,0 +1,73 @@
+"""The numbers that tell an enrolled object from one that only resembles it."""
+
+import numpy as np
+import pytest
+
+from hbr import DenseIndex
+from hbr.dense.evidence import COMMON, numbers
+from tests.hbr.dense.searches import LIGHT, belief_after, catalog, view
+
+QUERIES_DEG = (30.0, 150.0, 270.0)
+LEAD, SECOND, BETWEEN, EXPECTED, EXPECTED_OVER_BEST = range(COMMON)
+
+
+def search(index: DenseIndex, share: float, j: int = 2) -> np.ndarray:
+    """Return the numbers of a search for an object of which other objects' levels replace a share."""
+    rng = np.random.default_rng(3)
+    others = catalog(3, seed=9)
+    queries = [
+        np.where(rng.random(len(own)) < share, view(others, 1, deg), own)
+        for deg, own in ((deg, view(index.views, j, deg)) for deg in QUERIES_DEG)
+    ]
+    belief = belief_after(queries, QUERIES_DEG, index)
+    return numbers(belief, int(belief.probability().argmax()))
+
+
+@pytest.mark.parametrize("kind", ["cedd", LIGHT, "edges+colours+cedd+network"])
+@pytest.mark.parametrize("objects", [1, 2, 12])
+@pytest.mark.parametrize("step_deg", [90.0, 360.0])
+def test_numbers_are_finite_and_there_are_two_for_each_use_of_a_part(kind: str, objects: int, step_deg: float) -> None:
+    index = DenseIndex(catalog(objects, kind=kind, step_deg=step_deg))
+    belief = belief_after(index.views.descriptors[[0, 0]], (0.0, 90.0), index)
+    for leader in range(objects):
+        found = numbers(belief, leader)
+        assert found.shape == (COMMON + 2 * len(index.space.begin),)
+        assert np.isfinite(found).all()
+
+
+def test_a_more_similar_object_has_a_larger_lead() -> None:
+    index = DenseIndex(catalog(10))
+    found = np.array([search(index, share) for share in (0.5, 0.3, 0.1, 0.0)])
+    for number in (LEAD, BETWEEN):
+        assert (np.diff(found[:, number]) > 0).all()
+    assert (np.diff(found[:, COMMON:], axis=0) > 0).all()
+    assert ((found[:, SECOND] > 0) & (found[:, SECOND] <= 1)).all()
+    assert found[-1, BETWEEN] > 1 > found[0, BETWEEN]  # its enrolled views themselves, and a view that resembles them
+
+
+def test_the_expected_leads_hardly_depend_on_the_query() -> None:
+    index = DenseIndex(catalog(10))
+    own, changed = (search(index, share) for share in (0.0, 0.3))
+    np.testing.assert_allclose(own[[EXPECTED, EXPECTED_OVER_BEST]], changed[[EXPECTED, EXPECTED_OVER_BEST]], atol=0.1)
+    assert own[EXPECTED_OVER_BEST] < own[EXPECTED]
+
+
+def test_the_second_object_has_a_negative_margin() -> None:
+    index = DenseIndex(catalog(10))
+    belief = belief_after([view(index.views, 2, deg) for deg in QUERIES_DEG], QUERIES_DEG, index)
+    order = np.argsort(-belief.support.max(axis=1))
+    first, second = (numbers(belief, int(place)) for place in order[:2])
+    assert first[SECOND] > 0 > second[SECOND]
+    assert first[LEAD] > second[LEAD]
+
+
+def test_one_object_alone_is_compared_with_nothing() -> None:
+    index = DenseIndex(catalog(1))
+    found = search(index, 0.0, j=0)
+    z = belief_after([view(index.views, 0, deg) for deg in QUERIES_DEG], QUERIES_DEG, index).support.max() / 3
+    assert found[LEAD] == pytest.approx(z)
+    leads, each_z = np.split(found[COMMON:], 2)
+    np.testing.assert_array_equal(leads, each_z)
+    assert leads.sum() == pytest.approx(z, rel=0.05)
+    assert found[SECOND] == 1
+    assert found[EXPECTED] == found[EXPECTED_OVER_BEST]
