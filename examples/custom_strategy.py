@@ -14,6 +14,7 @@ from rig.search.strategies import (
     descriptor_for,
     end_by_margin,
 )
+from rig.views.description import BENCH_DESCRIPTOR
 from sim.bench import ShelfOperator
 
 OBJECTS = ("toy-house", "toy-car", "book-night")
@@ -29,10 +30,10 @@ class Golden:
 
 
 class FarSide:
-    """The far side of the object, on the dense search: the stopping rule says when the search ends."""
+    """The far side of the object, on the dense search: its probabilities end the search."""
 
     name = "far-side"
-    descriptor = "edges+colours"
+    descriptor = BENCH_DESCRIPTOR
 
     def next(self, state: DenseSearchState) -> Rotate | Finish:
         if state.decision.outcome is not hbr.Outcome.CONTINUE:

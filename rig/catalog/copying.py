@@ -30,8 +30,6 @@ from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable
 from rig.core.files import json_values
 from rig.core.next_steps import Do
 
-_RULES: Final = "search_rules.json"
-"""The stopping rule beside a catalog (`rig.search.stopping_rules`)."""
 _COPY: Final = "copy"
 """Property of a local copy: of which catalog, up to which line of its log, and when."""
 _PATIENCE: Final = 20  # a server that is away costs one wait in twenty-one times that long
@@ -228,8 +226,6 @@ def update_copy(catalog: Catalog) -> bool:
         changed = _update(catalog, made)
         shutil.rmtree(folder, ignore_errors=True)
         made.rename(folder)
-    with suppress(FileNotFoundError):
-        shutil.copyfile(catalog.path / _RULES, folder / _RULES)
     return changed
 
 

@@ -64,13 +64,3 @@ def _settings(evidence: Iterable[tuple[int, JsonObject | None]]) -> list[tuple[i
         if isinstance(locks, dict) and all(locks != known for _, known in found):
             found.append((view_id, locks))
     return found
-
-
-def newest_view(catalog: Catalog) -> str | None:
-    """Return the image of the first view of the newest enrollment in use; None if there is none."""
-    with catalog.database.read() as transaction:
-        newest = max((one.enrollment_id for one in state.used(transaction)), default=0)
-        view_id = transaction.scalar(select(View.id).where(View.index == 0, View.enrollment_id == newest))
-        if view_id is None and newest:
-            raise state.changed(["the first view of the newest enrollment"])
-        return None if view_id is None else state.view(transaction, view_id).image

@@ -8,6 +8,7 @@ from rig.charts import svg
 from rig.charts.xy import Axis, Chart, Series
 from rig.core.phrases import percent, percent_words, short
 from rig.events.events import Candidate, Ranked
+from rig.events.wording import NOT_ENROLLED
 
 SHOWN: Final = 5
 """Candidates of a chart: more lines cannot be told from each other."""
@@ -33,6 +34,8 @@ class Styles:
         self._styles: dict[str, Style] = {}
 
     def __getitem__(self, name: str) -> Style:
+        if name == NOT_ENROLLED:
+            return Style("none", dashed=False)
         place = len(self._styles)
         return self._styles.setdefault(name, Style(f"c{place % _COLOURS}", place // _COLOURS % 2 == 1))
 
@@ -48,6 +51,8 @@ def candidates_chart(
     alone: bool = False,
 ) -> str:
     """Draw the best five candidates: their probabilities, or their scores without them, after each view.
+
+    In the dense search, "not enrolled" is one more.
 
     Parameters
     ----------
@@ -70,7 +75,7 @@ def candidates_chart(
         return candidate_lines(ranked, styles, answer, min_score, rotated_deg, enough_deg).svg(alone=alone)
     parts = [svg.text("The leading candidates", (0, 13), "title", anchor="start")]
     best = _best(ranked[-1])
-    what = "score per view" if best[0].probability is None else "probability among the enrolled objects"
+    what = "score per view" if best[0].probability is None else "probability"
     parts.append(svg.text(what, (0, 30), "small", anchor="start"))
     y = 40.0
     for one in best:
@@ -98,7 +103,7 @@ def candidate_lines(
     enough_deg: float | None = None,
 ) -> Chart:
     """Return the chart of the candidates after several views; parameters as in `candidates_chart`."""
-    values = [{one.name: _value(one) for one in event.candidates} for event in ranked]
+    values = [{one.name: _value(one) for one in _all(event)} for event in ranked]
     x = [event.index + 1.0 if rotated_deg is None else rotated_deg[event.index] for event in ranked]
     series = []
     best = _best(ranked[-1])
@@ -121,12 +126,19 @@ def candidate_lines(
     upwards = Axis("score per view")
     if best[0].probability is not None:
         ticks = tuple(k / 4 for k in range(5))
-        upwards = Axis("probability among the enrolled objects", ticks=ticks, names=tuple(percent(t, 0) for t in ticks))
+        upwards = Axis("probability", ticks=ticks, names=tuple(percent(t, 0) for t in ticks))
     return Chart("The leading candidates", across, upwards, series)
 
 
 def _best(ranked: Ranked) -> list[Candidate]:
-    return sorted(ranked.candidates, key=_value, reverse=True)[:SHOWN]
+    return sorted(ranked.candidates, key=_value, reverse=True)[:SHOWN] + _all(ranked)[len(ranked.candidates) :]
+
+
+def _all(ranked: Ranked) -> list[Candidate]:
+    """Return the candidates, and with probabilities "not enrolled" as the last one."""
+    if ranked.decision is None:
+        return [*ranked.candidates]
+    return [*ranked.candidates, Candidate(NOT_ENROLLED, nan, nan, ranked.decision.not_enrolled)]
 
 
 def _value(one: Candidate) -> float:

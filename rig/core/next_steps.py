@@ -95,7 +95,6 @@ class Do(StrEnum):
     REMOVE_DELETED = "remove-deleted", "remove deleted objects from the disk", "rig catalog gc"
     VERIFY_CATALOG = "verify-catalog", "check the catalog", "rig catalog verify"
     REDESCRIBE = "redescribe", "describe the stored images again", "rig catalog redescribe"
-    FIT_STOPPING_RULE = "fit-stopping-rule", "fit the stopping rule again", "rig catalog fit"
     MERGE = "merge", "add the objects to a catalog", "rig import {source}"
     DELIVER_RENAMED = (
         "deliver-renamed",

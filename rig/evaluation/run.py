@@ -16,7 +16,6 @@ from hbr.evaluation.matrix import MATRIX
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.replaced import REPLACED
 from hbr.evaluation.trials import TRIALS
-from hbr.evaluation.unknown_objects import UNKNOWN_OBJECTS
 from rig.charts.evaluation_figures import figures
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, os_errors_as
@@ -30,7 +29,6 @@ FOLDER: Final = Path("rig-eval")
 _KINDS: Final[Mapping[str, Kind]] = {
     "trials": TRIALS,
     "matrix": MATRIX,
-    "unknown-objects": UNKNOWN_OBJECTS,
     "bench-change": BENCH_CHANGE,
     "replaced": REPLACED,
 }

@@ -49,13 +49,11 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
             return [_curves(results, rows), _decisions(results), _stated(stated), _poses(results)]
         case "matrix":
             return [_matrix(rows)]
-        case "unknown-objects":
-            return [_unknown_objects(rows)]
         case "replaced":
             return [_replaced(rows)]
         case _:
             by_change = {f"{row['change']}, {row['objects']}": row for row in rows}
-            return [_changes(rows), _intervals(rows), _stated(by_change)]
+            return [_changes(rows), _intervals(rows), _probabilities(by_change), _stated(by_change)]
 
 
 def _pivot(
@@ -138,22 +136,6 @@ def _matrix(rows: Sequence[Row]) -> Rows:
     )
 
 
-def _unknown_objects(rows: Sequence[Row]) -> Rows:
-    """Return nominal rates by views, with the measured false rejects and false accepts in percent."""
-
-    def cell(row: Row) -> str:
-        rejected, accepted = row["false_rejects"] / row["known_trials"], row["false_accepts"] / row["unknown_trials"]
-        return f"{100 * rejected:.2f} / {100 * accepted:.2f}"
-
-    return _pivot(
-        "false rejects / accepts, %, at N =",
-        sorted(rows, key=lambda row: (row["fitted"], row["nominal"])),
-        lambda row: f"nominal {100 * row['nominal']:g}{', fitted' if row['fitted'] else ''}",
-        "views",
-        cell,
-    )
-
-
 def _replaced(rows: Sequence[Row]) -> Rows:
     """Return the shares of searches in percent; enrolled objects are marked +, others -.
 
@@ -217,6 +199,17 @@ def _intervals(rows: Sequence[Row]) -> Rows:
         ["% [95 % interval by objects]", *(f"{row['change']}: {row['objects']}" for row in rows)],
         [[name, *(cell(row, share) for row in rows)] for share, name in names.items()],
     )
+
+
+def _probabilities(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
+    """Return the stated probabilities beside the shares that they promise, in percent, by the name of the row."""
+    heads = "stated probability, mean %|named objects|stated|right|not enrolled: enrolled|left out"
+    keys = ("accepted_stated", "accepted_right", "enrolled_not_enrolled", "left_out_not_enrolled")
+
+    def cells(own: Mapping[str, Any]) -> list[str]:
+        return ["–" if own[key] is None else _percent(own[key]) for key in keys]
+
+    return Rows(heads.split("|"), [[name, f"{own['accepted_searches']}", *cells(own)] for name, own in rates.items()])
 
 
 def cost_sentence(results: Mapping[str, Any]) -> str | None:

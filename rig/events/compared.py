@@ -17,9 +17,9 @@ Image = Annotated[NDArray[np.uint8], NO_JSON, Field(exclude=True, default=np.emp
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """The leading candidate was doubtful, so its enrolled views were compared with the search's views pixel by pixel.
+    """The enrolled views of the two leading candidates were compared with the views so far, pixel by pixel.
 
-    A replay does not repeat this comparison: it uses the saved ``fit`` and ``others``.
+    A replay does not repeat this comparison: it uses the saved ``fit``, ``others`` and ``expected``.
     """
 
     event: Literal["verified"] = field(default="verified", init=False)
@@ -30,15 +30,15 @@ class Verified:
     fit: float
     """Share of the views' contrast that the enrolled views of this candidate explain, at most 1."""
     others: float
-    """Mean of the same share over the next candidates, at most 1."""
-    score: float
-    """Log-odds that this candidate is the object on the table, from ``fit``, ``others`` and the open-set score."""
-    found_from: float
-    """Lowest score at which the object is found, if its probability is high enough."""
-    unknown_below: float
-    """Score below which the object is unknown."""
+    """The same share for the second candidate, at most 1; 0 without one."""
+    expected: float
+    """Share of the contrast that two neighbouring enrolled views of this candidate explain of each other, at most 1."""
     outcome: Outcome
-    """Result of the comparison: ``found``, ``ambiguous`` or ``unknown``."""
+    """Decision after the comparison: ``continue``, ``found``, ``ambiguous`` or ``unknown``."""
+    probability: float
+    """Probability of this candidate after the comparison."""
+    not_enrolled: float
+    """Probability that the object on the table is not enrolled, after the comparison."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,10 @@ from enum import StrEnum
 from functools import cache
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import ConfigDict, Discriminator, Field, GetCoreSchemaHandler, TypeAdapter, ValidationError
-from pydantic_core import CoreSchema, from_json, to_json
+from pydantic import ConfigDict, Discriminator, Field, TypeAdapter, ValidationError
+from pydantic_core import from_json, to_json
 
 from hbr import Outcome, StopDecision, StopReason
-from rig.core.json_form import NumberOrNull
 from rig.events.compared import Compared, Image, Verified
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
@@ -35,9 +34,6 @@ class NoteCode(StrEnum):
     EMPTY_TABLE_OF_ENROLLMENT = "empty-table-of-enrollment"
     EMPTY_TABLE_CHANGED = "empty-table-changed"
     TABLE_DIFFERS = "table-differs"
-    STOPPING_RULE_UNREADABLE = "stopping-rule-unreadable"
-    STOPPING_RULE_OUTDATED = "stopping-rule-outdated"
-    RATES_NOT_GUARANTEED = "rates-not-guaranteed"
     NOT_RECORDED = "not-recorded"
     NOT_COMPARED = "not-compared"
     LOCAL_COPY = "local-copy"
@@ -198,9 +194,8 @@ class Accepted:
     segmentation: dict[str, Any] | None = None
     """How the program found the object in the image and corrected the illumination; ``issues`` lists the steps that
     were not possible. Null if the view was not segmented."""
-    same_bench: bool | None = None
-    """Whether the first view of an identification shows the bench as it was at the enrollment; null if this is not
-    known, and in an enrollment."""
+    other_bench: bool = False
+    """Whether the empty-table image of an identification certainly shows another bench than that of the enrollment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,20 +209,9 @@ class Candidate:
     pose_deg: float
     """Azimuth of the camera around this object at the last view, with the 0° of the object's enrollment."""
     probability: float | None = None
-    """Share of this object among the enrolled objects: its probability if the object on the table is one of them; null
-    in the paper's search."""
-
-
-class _NullThreshold:
-    """Lets the open-set threshold of a decision be null in JSON: it is -inf if no object is unknown."""
-
-    @staticmethod
-    def __get_pydantic_core_schema__(source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        schema = handler(source)
-        of_dataclass: Any = handler.resolve_ref_schema(schema)  # `hbr` does not know pydantic
-        (threshold,) = (one for one in of_dataclass["schema"]["fields"] if one["name"] == "open_set_threshold")
-        threshold["schema"] = handler.generate_schema(NumberOrNull)
-        return schema
+    """Probability that it is the object on the table. In the dense search, the probabilities of all enrolled objects
+    and ``not_enrolled`` have the sum 1; with ``hmm``, those of the enrolled objects alone. Null in the paper's
+    search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,8 +226,9 @@ class Ranked:
     margin: float
     """Score per view of the first candidate minus the highest score of any other enrolled object. The paper's search
     uses an upper bound of that score. The margin can be negative."""
-    decision: Annotated[StopDecision, _NullThreshold()] | None = None
-    """Decision of the stopping rule after this view; null in the paper's search, and with ``hmm``."""
+    decision: StopDecision | None = None
+    """Decision of the dense search after this view, with the probability ``not_enrolled``; null in the paper's search,
+    and with ``hmm``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,10 +251,10 @@ class FrameUsed:
     name: str
     """Name of the best candidate."""
     probability: float
-    """Probability of the best candidate among the enrolled objects."""
+    """Probability of the best candidate."""
     outcome: Outcome
-    """Decision that the stopping rule would make now: ``continue``, ``found``, ``ambiguous`` or ``unknown``. It decides
-    only when the frames have covered another step of the circle."""
+    """Decision that the search would make now: ``continue``, ``found``, ``ambiguous`` or ``unknown``. It decides only
+    when the frames have covered another step of the circle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -544,15 +529,13 @@ class Identified:
     min_margin: float | None = None
     """Paper's search: margin at which the search ends. Null in the dense search, and with ``hmm``."""
     confidence: float | None = None
-    """Dense search, and ``hmm``: probability of the object among the enrolled objects. Null if the object is ambiguous
-    or unknown, and in the paper's search."""
+    """Dense search, and ``hmm``: probability of the object. Null if the object is ambiguous or unknown, and in the
+    paper's search."""
     min_confidence: float | None = None
     """Dense search, and ``hmm``: confidence at which the search ends. Null in the paper's search."""
-    open_set_score: float | None = None
-    """Dense search: how closely the views resemble an enrolled object. Null in the paper's search."""
-    open_set_threshold: float | None = None
-    """Dense search: open-set score below which an object is unknown. Null if no object is called unknown, and in the
-    paper's search."""
+    not_enrolled: float | None = None
+    """Dense search: probability that the object on the table is not enrolled. Null in the paper's search, and with
+    ``hmm``."""
     left_out: tuple[LeftOut, ...] = ()
     """Views that the answer does not use; ``views`` does not count them."""
 

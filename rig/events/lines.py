@@ -40,6 +40,7 @@ from rig.events.events import (
     Warned,
 )
 from rig.events.wording import (
+    NOT_ENROLLED,
     answer_lines,
     change_words,
     comparison_words,
@@ -62,7 +63,7 @@ SHOWN = 3
 _ENOUGH: Final = {
     Outcome.CONTINUE: "",
     Outcome.FOUND: ", enough to end the search",
-    Outcome.UNKNOWN: ", resembles no enrolled object enough",
+    Outcome.UNKNOWN: ", not enrolled",
     Outcome.AMBIGUOUS: ", ambiguous",
 }
 
@@ -122,8 +123,10 @@ def page_line(event: Event) -> str:
         case Accepted():
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():
-            leaders = ", ".join(_leader(c, event) for c in event.candidates[:SHOWN])
-            return f"  candidates: {leaders} (margin {signed(event.margin, 3)})"
+            leaders = [_leader(one) for one in event.candidates[:SHOWN]]
+            if event.decision is not None:
+                leaders.append(f"{NOT_ENROLLED} ({percent_words(event.decision.not_enrolled)})")
+            return f"  candidates: {', '.join(leaders)} (margin {signed(event.margin, 3)})"
         case FrameUsed():
             return f"  {_frame_words(event)}"
         case ObjectChanged():
@@ -166,15 +169,14 @@ def page_line(event: Event) -> str:
             return f"Error {event.code} ({event.error}): {event.what}"
 
 
-def _leader(one: Candidate, ranked: Ranked) -> str:
-    share = share_words(one, ranked.decision)
+def _leader(one: Candidate) -> str:
+    share = share_words(one)
     return f"{one.name} {one.score:.3f}{f' ({share})' if share else ''} at {azimuth_words(one.pose_deg)}°"
 
 
 def _frame_words(used: FrameUsed) -> str:
     """Return the state of a search in motion after a frame, in words."""
-    share = "" if used.outcome is Outcome.UNKNOWN else f" {percent_words(used.probability)}"
-    best = f"{used.name}{share}{_ENOUGH[used.outcome]}"
+    best = f"{used.name} {percent_words(used.probability)}{_ENOUGH[used.outcome]}"
     where = f"azimuth {azimuth_words(used.azimuth_deg)}°, {used.seconds:.1f} s"
     rejected = f" ({counted(used.rejected, 'frame')} rejected)" if used.rejected else ""
     return f"in motion: {best}; view {used.index + 1}, {where}{rejected}"

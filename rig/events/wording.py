@@ -1,11 +1,10 @@
 """Steps and answers of a search, and notes of a plan, in words: the same on the terminal and in the report."""
 
 from collections.abc import Sequence
-from math import ceil, isfinite, nan
+from math import ceil, nan
 from typing import Any, Final
 
 from hbr import Outcome, StopDecision, StopReason
-from hbr.dense.stopping import Limitation, LimitationCode
 from rig.core.next_steps import Do, NextSteps, steps_from_json
 from rig.core.phrases import (
     angle_range,
@@ -13,7 +12,6 @@ from rig.core.phrases import (
     counted,
     distinct,
     joined,
-    percent,
     percent_words,
     sentence,
     signed,
@@ -38,6 +36,8 @@ from rig.events.events import (
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.table_problems import problem_text
 
+NOT_ENROLLED: Final = "not enrolled"
+"""What the object on the table may be, beside the candidates."""
 NAMED = 5
 """Objects that an ambiguous answer names."""
 ARCS_NAMED = 3
@@ -97,43 +97,34 @@ def _side_words(side: str, s_left: float, s_right: float, candidates: int) -> st
 
 
 def stop_words(decision: StopDecision, views: int) -> str:
-    """Return what the stopping rule decided after ``views`` views, and why."""
+    """Return what the search decided after ``views`` views, and why."""
     share, least = percent_words(decision.probability), percent_words(decision.min_confidence)
-    above = decision.open_set_score - decision.open_set_threshold
     match decision.reason:
         case StopReason.CONFIDENT:
-            known = f", and the open-set score is {abs(above):.3f} above its threshold"
-            return f"the confidence {share} reaches {least}{known if isfinite(above) else ''}"
-        case StopReason.UNCHANGED_BENCH:
-            known = f"and the open-set score is {above:.3f} above the threshold of an unchanged bench"
-            return f"the confidence {share} reaches {least}, {known}"
+            return f"the confidence {share} reaches {least}"
+        case StopReason.NOT_ENROLLED:
+            return f"not enrolled with {percent_words(decision.not_enrolled)}"
         case StopReason.BADLY_SEGMENTED:
             return "the background is not known yet; another view shows it"
         case StopReason.NOT_CONFIDENT:
             return f"not confident yet: {share}, and {least} ends the search"
-        case StopReason.BELOW_OPEN_SET_THRESHOLD if decision.outcome is Outcome.CONTINUE:
-            return f"the open-set score is still {abs(above):.3f} below its threshold"
-        case StopReason.BELOW_OPEN_SET_THRESHOLD:
-            return f"no enrolled object is similar enough: the open-set score is {abs(above):.3f} below its threshold"
         case _:
             return f"the best candidate after {counted(views, 'view')}, with a probability of {share} below {least}"
 
 
 def ranking_words(ranked: Ranked | None) -> str:
-    """Return what the stopping rule decided with a ranking, and why; empty if no rule did."""
+    """Return what the search decided with a ranking, and why; empty in the paper's search."""
     return "" if ranked is None or ranked.decision is None else stop_words(ranked.decision, ranked.index + 1)
 
 
 def verification_words(verified: Verified) -> str:
     """Return what the comparison of the leading candidate with the views found, as a sentence without its full stop."""
-    own, others = percent_words(verified.fit), percent_words(verified.others)
-    results = {
-        Outcome.FOUND: "so it is this object",
-        Outcome.UNKNOWN: "so it is another object",
-        Outcome.AMBIGUOUS: "which does not tell whether it is this object",
-    }
-    shares = f"its enrolled views explain {own} of the contrast, those of other candidates {others}"
-    return f"compared with {verified.name} pixel by pixel: {shares}, {results[verified.outcome]}"
+    own, others, expected = map(percent_words, (verified.fit, verified.others, verified.expected))
+    return (
+        f"compared with {verified.name} pixel by pixel: its enrolled views explain {own} of the contrast (of each "
+        f"other {expected}), those of the second candidate {others}; it is {verified.name} with "
+        f"{percent_words(verified.probability)}, and not enrolled with {percent_words(verified.not_enrolled)}"
+    )
 
 
 def change_words(change: ObjectChanged) -> str:
@@ -165,26 +156,23 @@ def reason_words(answer: Identified) -> str:
             return f"the margin {answer.margin:.3f} per view reaches {answer.min_margin:g}"
         case StopReason.NO_ROTATION_LEFT:
             return "the cable allows no other view"
-        case StopReason.PIXEL_FIT:
-            return "the views were compared with the enrolled views of the leading candidate pixel by pixel"
         case StopReason.LOCAL_DIFFERENCE if answer.outcome is Outcome.FOUND:
             return "the leading candidates were compared pixel by pixel where they differ most"
         case StopReason.LOCAL_DIFFERENCE:
             return "the views fit two enrolled objects up to noise, and do not tell which one it is"
         case StopReason.CUSTOM:
             return answer.note
-        case StopReason.MAX_VIEWS if answer.open_set_score is None:
+        case StopReason.MAX_VIEWS if answer.not_enrolled is None:
             return f"the search took all {counted(answer.views, 'view')} that are allowed"
     share = answer.candidates[0].probability if answer.confidence is None else answer.confidence
-    numbers = (share, answer.min_confidence, answer.open_set_score, answer.open_set_threshold)
-    share, least, score, threshold = (nan if number is None else number for number in numbers)
-    return stop_words(StopDecision(answer.outcome, answer.reason, 0, share, least, score, threshold), answer.views)
+    numbers = (share, answer.not_enrolled, answer.min_confidence)
+    share, not_enrolled, least = (nan if number is None else number for number in numbers)
+    return stop_words(StopDecision(answer.outcome, answer.reason, 0, share, not_enrolled, least), answer.views)
 
 
-def share_words(one: Candidate, decision: StopDecision | None) -> str:
-    """Return a candidate's probability among the enrolled objects; empty for none, or if the object is unknown."""
-    unknown = decision is not None and decision.outcome is Outcome.UNKNOWN
-    return "" if unknown or one.probability is None else percent_words(one.probability)
+def share_words(one: Candidate) -> str:
+    """Return a candidate's probability; empty in the paper's search."""
+    return "" if one.probability is None else percent_words(one.probability)
 
 
 def move_words(moved: Moved) -> str:
@@ -263,20 +251,27 @@ def outcome_words(answer: Identified) -> str:
 
 
 def _one_of(answer: Identified) -> str:
-    """Return the objects that an ambiguous one may be, with their probabilities if there are some."""
+    """Return what an ambiguous object may be, with the probabilities if there are some."""
     probability = {one.name: one.probability for one in answer.candidates}
     items = [
         name if (share := probability.get(name)) is None else f"{name} ({percent_words(share)})"
         for name in answer.possible[:NAMED]
     ]
     more = len(answer.possible) - NAMED
-    return f"{', '.join(items)} or {more} more" if more > 0 else joined(items, "or")
+    items += [f"{more} more"] if more > 0 else []
+    if answer.not_enrolled is not None:
+        items.append(f"{NOT_ENROLLED} ({percent_words(answer.not_enrolled)})")
+    return joined(items, "or")
 
 
 def answer_lines(answer: Identified) -> list[str]:
     """Return the result, and why the search ended."""
     reason = sentence(reason_words(answer))
-    if answer.outcome is Outcome.UNKNOWN and answer.candidates[0].probability is not None:
+    if (
+        answer.outcome is Outcome.UNKNOWN
+        and answer.candidates[0].probability is not None
+        and answer.not_enrolled is None
+    ):
         reason += " Percentages of candidates are shares among the enrolled objects."
     if answer.left_out:
         reason += f" The object changed, so {counted(len(answer.left_out), 'earlier view')} did not count."
@@ -350,21 +345,6 @@ def note_words(note: Note) -> str:
             return f"the bench no longer looks like its empty-table image: {problem_text(v['problem'])}"
         case NoteCode.TABLE_DIFFERS:
             return f"the table does not look as it did at {v['taken_utc']}; an object that is round may be on it"
-        case NoteCode.STOPPING_RULE_UNREADABLE:
-            return f"the stored stopping rule cannot be read ({v['reason']})"
-        case NoteCode.STOPPING_RULE_OUTDATED:
-            changes = [f"{counted(v[key], 'object')} {key}" for key in ("added", "removed") if v[key]]
-            changed = ", ".join(changes) or "other views, or another version of this program"
-            return (
-                f"the stopping rule is from {v['made']}, and the catalog has changed since ({changed}), so it "
-                "guarantees no error rate"
-            )
-        case NoteCode.RATES_NOT_GUARANTEED:
-            accepted = f" and {percent(v['false_accept'])} of other objects accepted" if "false_accept" in v else ""
-            return (
-                f"{v['searches']} leave-one-out searches cannot guarantee at most {percent(v['error_rate'])} wrong "
-                f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown{accepted}"
-            )
         case NoteCode.NOT_RECORDED:
             return f"the answer is not recorded: {v['what'].rstrip('.')}"
         case NoteCode.NOT_COMPARED:
@@ -388,8 +368,6 @@ def note_steps(note: Note) -> NextSteps:
             return ("Continue; these views do not use the image.", Do.EMPTY_TABLE())
         case NoteCode.TABLE_DIFFERS:
             return ("Check that the table is empty. If it is not, remove the object, and", Do.EMPTY_TABLE())
-        case NoteCode.STOPPING_RULE_UNREADABLE | NoteCode.STOPPING_RULE_OUTDATED | NoteCode.RATES_NOT_GUARANTEED:
-            return (Do.FIT_STOPPING_RULE(),)
         case _:
             return steps_from_json(note.values.get("steps", ()))
 
@@ -397,51 +375,6 @@ def note_steps(note: Note) -> NextSteps:
 def wait_words(reason: WaitReason) -> str:
     """Return what a plan waits for."""
     return "the next object" if reason is WaitReason.NEXT_OBJECT else "the first object, on the empty table"
-
-
-def limitation_words(limitation: Limitation) -> str:
-    """Return what a stopping rule does not guarantee, as a sentence without its full stop."""
-    v = limitation.values
-    match limitation.code:
-        case LimitationCode.SAMPLED:
-            return (
-                f"only {v['searched']} of {counted(v['objects'], 'object')} were searched for, so no rate is "
-                "guaranteed; fit the rule to all of them"
-            )
-        case LimitationCode.FALSE_REJECT_RATE:
-            return (
-                f"a false-reject rate of {percent(v['rate'])} needs {v['needed']} leave-one-out searches, and there "
-                f"are {v['searches']}: objects that score less than every search did are unknown, a rate of "
-                f"{percent(v['reached'])}"
-            )
-        case LimitationCode.ERROR_RATE | LimitationCode.SIMILAR_OBJECTS:
-            why = (
-                f"needs {v['needed']} leave-one-out searches, and there are {v['searches']}"
-                if limitation.code is LimitationCode.ERROR_RATE
-                else "cannot be reached, because enrolled objects are too similar"
-            )
-            return (
-                f"an error rate of {percent(v['rate'])} {why}: a search ends at a confidence of "
-                f"{percent(v['min_confidence'], 0)}, at which {v['wrong']} of {v['ended']} were wrong"
-            )
-        case LimitationCode.FALSE_ACCEPT_RATE:
-            return (
-                f"on an unchanged bench, more than {percent(v['rate'])} of the objects that are not enrolled may be "
-                f"accepted, because enrolled objects are too similar: {v['accepted']} of {v['searches']} left-out "
-                f"objects were ({percent(v['accepted'] / v['searches'])})"
-            )
-        case LimitationCode.UNKNOWN_NOT_MEASURED:
-            return "unknown objects cannot be measured with fewer than three objects; enroll more"
-        case LimitationCode.ONE_OBJECT:
-            return (
-                "with one object there is no other candidate: it is found by the similarity to its own views alone, "
-                "and no rate is guaranteed; enroll more"
-            )
-        case LimitationCode.SINGLE_VIEWS:
-            return (
-                "no rule can be fitted to objects with a single view: no object is called unknown, and no rate is "
-                "guaranteed; enroll more"
-            )
 
 
 def _some(names: list[str]) -> str:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap360
 from hbr.dense.local_difference import LocalView
-from hbr.dense.session import answered
+from hbr.dense.session import Asking, answered
 from rig.bench import Bench, Placer
 from rig.catalog import Catalog, Provenance
 from rig.catalog.journal import open_for_enrollment
@@ -55,7 +55,7 @@ from rig.motion.scan_speed import can_fly, require_camera_time, scan_speed
 from rig.motion.turntable import Turntable
 from rig.plans.steps import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
 from rig.search.model import Model, begin_search, empty_table_for
-from rig.search.session import SHOWN, Hypotheses, Search
+from rig.search.session import SHOWN, Search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
@@ -80,6 +80,8 @@ class ViewsAtRest:
     ----------
     check
         Gets image and azimuth of the first view, and raises an error if it shows no object.
+    compared
+        Takes a step of the search that asks for enrolled views.
     live
         Called with the event of each frame of a search in motion.
     number
@@ -95,6 +97,7 @@ class ViewsAtRest:
     viewer: Viewer
     describe: SearchDescriber
     check: Callable[[NDArray[np.uint8], float], None]
+    compared: Callable[[Asking[Event | None]], Generator[Event, None, None]]
     live: Callable[[FrameUsed], object]
     first_rest_s: float = FIRST_REST_S
     number: int = 0
@@ -138,10 +141,12 @@ class ViewsAtRest:
         if self.number == 0:
             self.check(captured.image_bgr, azimuth_deg)
         yield from warn_of_table(self.bench, self.number, described)
-        ranked, step = self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
-        self.ended_ns, self.is_over = self.bench.clock.now_ns(), isinstance(step, Finish)
+        self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
         if (changed := self.search.changed()) is not None:
             yield changed
+        yield from self.compared(self.search.verify(self.describe.hypotheses))
+        ranked, step = self.search.decide()
+        self.ended_ns, self.is_over = self.bench.clock.now_ns(), isinstance(step, Finish)
         if self.search.is_new_decision:
             yield ranked
 
@@ -246,7 +251,7 @@ class ViewsInMotion(ViewsAtRest):
         assert motion is not None
         azimuth_deg = float(wrap360(self.sign * motion.angle_deg))
         self.unseen.append(accepted(self.number, azimuth_deg, attempt, described))
-        ranked, step = self.search.add(described, azimuth_deg, table_deg=motion.angle_deg)
+        self.search.add(described, azimuth_deg, table_deg=motion.angle_deg)
         if (changed := self.search.changed()) is not None:
             self.unseen.append(changed)
         used = self.search.frame_used(self.number, azimuth_deg, self.seconds, self.rejected)
@@ -255,6 +260,7 @@ class ViewsInMotion(ViewsAtRest):
         # Follow a new decision: stop, or steer to another goal.
         if not self.search.is_new_decision:
             return None
+        ranked, step = self.search.decide()
         self.unseen.append(ranked)
         if isinstance(step, Finish):
             self.ended_ns, self.is_over = self.bench.clock.now_ns(), True
@@ -285,13 +291,13 @@ def identify(
     """Identify the object on the table; yields events and returns the answer.
 
     After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). ``dense`` is the
-    bench's own: it takes the next best view until the stopping rule, which was fitted to the catalog, finds an
-    object or calls it unknown. ``ahbr`` is the paper's: the first rotation is fixed, and each further one leads to the
-    side on which the candidates look less similar (Eq. 5-7). The search ends when an enrolled object leads all others
-    by ``identify.margin`` per view, or after ``identify.max_views``. The object is unknown if its score per view is
-    below ``identify.min_score``; the default comes from the scores of the enrolled views among each other
-    (`hbr.open_set_threshold`). ``hmm``, the successor of the paper, ends when an object has a probability of 98 %, or
-    after ``identify.max_views``, and calls objects unknown like ``ahbr``. Closing the generator turns the torque off.
+    bench's own: it takes the next best view until an object, or "not enrolled", is probable enough. ``ahbr`` is the
+    paper's: the first rotation is fixed, and each further one leads to the side on which the candidates look less
+    similar (Eq. 5-7). The search ends when an enrolled object leads all others by ``identify.margin`` per view, or
+    after ``identify.max_views``. The object is unknown if its score per view is below ``identify.min_score``; the
+    default comes from the scores of the enrolled views among each other (`hbr.open_set_threshold`). ``hmm``, the
+    successor of the paper, ends when an object has a probability of 98 %, or after ``identify.max_views``, and calls
+    objects unknown like ``ahbr``. Closing the generator turns the torque off.
 
     Parameters
     ----------
@@ -341,8 +347,7 @@ def identify(
         search.descriptor,
         empty_table,
         revise=not search.in_motion,
-        # a camera that moves around the object sees another background in each view
-        bench_image=model.empty_table if bench.config.table.carries == "camera" else model.bench_image,
+        enrolled_table=model.empty_table,
     )
     check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
     (placer or bench).place(None)
@@ -358,7 +363,8 @@ def identify(
     )
     # Take views until the search ends.
     kind = ViewsInMotion if search.in_motion else ViewsAtRest
-    views = kind(bench, search, viewer, describe, check, live)
+    compared = _Comparisons(model, search)
+    views = kind(bench, search, viewer, describe, check, compared, live)
     try:
         with views.table as table:
             yield from views.begin()
@@ -374,7 +380,7 @@ def identify(
         # The events of an interrupted arc come when the torque is off, because their consumer may pause.
         yield from views.unseen
         raise
-    yield from _last_steps(model, search, describe.hypotheses)
+    yield from compared(search.compare(describe.hypotheses))
     answer = search.answer(travelled_deg=views.travelled_deg, seconds=seconds)
     yield answer
     if failed:  # the answer is reported first
@@ -391,9 +397,10 @@ def _noticed(search: Search, events: Generator[Event, None, None]) -> Generator[
 
 def _flies(config: RigConfig, model: Model) -> bool:
     """Return whether a search without a named strategy takes frames in motion, by ``identify.mode``."""
-    is_dense = model.rule is not None
     mode = config.identify.mode
-    return is_dense and config.identify.strategy is None and (mode == "fly" or (mode == "auto" and can_fly(config)))
+    return (
+        model.is_dense and config.identify.strategy is None and (mode == "fly" or (mode == "auto" and can_fly(config)))
+    )
 
 
 def _unwound(number: int, table: Turntable) -> Generator[Event, None, RigError | None]:
@@ -407,25 +414,36 @@ def _unwound(number: int, table: Turntable) -> Generator[Event, None, RigError |
     return None
 
 
-def _last_steps(model: Model, search: Search, hypotheses: Hypotheses) -> Generator[Event, None, None]:
-    """Take the last steps of a search. If an enrolled image is missing, the answer is the one without it."""
-    missing: list[CatalogError] = []
+@dataclass(eq=False)
+class _Comparisons:
+    """Takes the steps of a search that ask for enrolled views, and yields their events.
 
-    def enrolled(object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
-        try:
-            return None if model.leader_views is None else model.leader_views(search.names[object_index], azimuths_deg)
-        except CatalogError as error:
-            missing.append(error)
-            return None
+    If an enrolled image is missing, the search decides without it; only the first one is reported.
+    """
 
-    for step in search.last_steps(hypotheses):
-        event = answered(step, enrolled)
-        for error in missing:
-            values = {key: value for key, value in error.as_dict().items() if key in ("what", "next_step", "steps")}
-            yield Warned(search.ranked.index, Note(NoteCode.NOT_COMPARED, values))
-        missing.clear()
+    model: Model
+    search: Search
+    _missing: CatalogError | None = field(default=None, init=False)
+
+    def __call__(self, step: Asking[Event | None]) -> Generator[Event, None, None]:
+        known = self._missing
+        event = answered(step, self._enrolled)
+        if known is None and self._missing is not None:
+            values = {key: value for key, value in self._missing.as_dict().items() if key in _SAID}
+            yield Warned(None, Note(NoteCode.NOT_COMPARED, values))
         if event is not None:
             yield event
+
+    def _enrolled(self, object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
+        read, name = self.model.leader_views, self.search.names[object_index]
+        try:
+            return None if read is None else read(name, azimuths_deg)
+        except CatalogError as error:
+            self._missing = error
+            return None
+
+
+_SAID: Final = ("what", "next_step", "steps")
 
 
 def watch(

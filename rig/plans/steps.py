@@ -98,7 +98,7 @@ def warn_of_table(bench: Bench, index: int, view: DescribedView) -> Generator[Ev
 def accepted(index: int, azimuth_deg: float, attempt: Attempt, described: DescribedView) -> Accepted:
     """Return the event of an accepted view."""
     return Accepted(
-        index, azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation, described.same_bench
+        index, azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation, described.other_bench
     )
 
 

@@ -18,10 +18,11 @@ from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
-from rig.core.phrases import azimuth_words, counted, sentence, signed
+from rig.core.phrases import azimuth_words, counted, percent_words, sentence, signed
 from rig.core.templates import environment
 from rig.events.events import Decided
 from rig.events.wording import (
+    NOT_ENROLLED,
     answer_words,
     comparison_words,
     decision_words,
@@ -248,9 +249,10 @@ def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> Sh
     leading = []
     if thought:
         leading = [
-            (one.name, styles[one.name], f"{one.score:.3f}", share_words(one, thought.decision))
-            for one in thought.candidates[:_LEADING]
+            (one.name, styles[one.name], f"{one.score:.3f}", share_words(one)) for one in thought.candidates[:_LEADING]
         ]
+        if thought.decision is not None:
+            leading.append((NOT_ENROLLED, styles[NOT_ENROLLED], "", percent_words(thought.decision.not_enrolled)))
     # What a search decides at its end follows from all of these, so the last card says all of them.
     words = [ranking_words(thought)]
     if view is record.views[-1]:

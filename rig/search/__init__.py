@@ -1,1 +1,1 @@
-"""A search without its hardware: model, session, strategies, stopping rules, saved runs, replay."""
+"""A search without its hardware: model, session, strategies, saved runs, replay."""

@@ -1,4 +1,4 @@
-"""The model of a search: the enrolled views by one descriptor, and the stopping rule. A search begins with it.
+"""The model of a search: the enrolled views by one descriptor. A search begins with it.
 
 `CurrentModel` is that of a catalog, loaded again when the catalog has changed.
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.dense.arc import ArcSession, fit_arc_confidence
+from hbr.dense.arc import ArcSession
 from hbr.paper.hmm import PoseModel
 from rig.bench import Bench
 from rig.catalog import Catalog, derived, sessions
@@ -26,24 +26,20 @@ from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageErr
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
 from rig.search.session import SHOWN, DenseSearch, EnrolledViews, HoughSearch, PoseSearch, Search
-from rig.search.stopping_rules import FILE, stopping_rule_of
 from rig.search.strategies import AnyStrategy, descriptor_for, has_poses, is_in_motion, strategy_for
 from rig.search.strategies import strategy as strategy_named
-from rig.views.description import BENCH_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, DENSE_DESCRIPTORS
 from rig.views.empty_table import empty_table_status
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Enrolled views, prepared for searches: the paper's, or with a stopping rule the dense ones.
+    """Enrolled views, prepared for searches: the paper's, or the dense ones.
 
     Attributes
     ----------
     index : hbr.ViewIndex or hbr.DenseIndex
         Index for the paper's searches, or for the dense search.
-    rule : hbr.StoppingRule, optional
-        Ends the dense search and decides which objects are unknown; `hbr.fit_stopping_rule` makes it. None for the
-        paper's.
     notes
         For the operator about an answer by this model.
     with_empty_table
@@ -52,20 +48,16 @@ class Model:
         The camera's settings of the enrollments, each combination once.
     empty_table : uint8 array (H, W, 3), optional
         The newest sheet of empty-table images of the enrollments (`rig.views.table_sheet`).
-    bench_image : uint8 array (H, W, 3), optional
-        An image that shows the bench of the newest enrollment: its empty-table image, or one of its views.
     leader_views
         Returns the enrolled views of an object near some azimuths (`rig.catalog.derived.local_views`); None if the
         model does not come from a catalog.
     """
 
     index: hbr.ViewIndex | hbr.DenseIndex
-    rule: hbr.StoppingRule | None = None
     notes: tuple[Note, ...] = ()
     with_empty_table: bool | None = None
     camera: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
     empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
-    bench_image: NDArray[np.uint8] | None = field(default=None, repr=False)
     leader_views: EnrolledViews | None = field(default=None, repr=False)
 
     @property
@@ -74,24 +66,30 @@ class Model:
         return self.index.views
 
     @property
+    def is_dense(self) -> bool:
+        """Whether it is for the dense search."""
+        return isinstance(self.index, hbr.DenseIndex)
+
+    @property
     def descriptor(self) -> str:
         """The descriptor of the enrolled views, and of queries."""
         return self.views.descriptor
 
 
-def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:
-    """Return a model of views: for the dense search if there is a stopping rule, else for the paper's.
+def model_of(views: hbr.Views) -> Model:
+    """Return a model of views: for the dense search if their descriptor is of it, else for the paper's."""
+    return Model(_index(views))
 
-    Raises `ValueError` for views by the bench's own descriptor without a stopping rule.
-    """
-    if rule is None and views.descriptor == BENCH_DESCRIPTOR:
-        raise ValueError(f"the stopping rule for views by {views.descriptor} is missing")
-    return Model(hbr.ViewIndex(views) if rule is None else hbr.DenseIndex(views), rule)
+
+def _index(views: hbr.Views) -> hbr.ViewIndex | hbr.DenseIndex:
+    if views.descriptor in DENSE_DESCRIPTORS and len(views):
+        return hbr.DenseIndex(views)
+    # without views, any search may say that the catalog is empty
+    return hbr.ViewIndex(views if len(views) else hbr.Views.empty())
 
 
 _tree = lru_cache(maxsize=4)(partial(hbr.ViewIndex, method="tree"))  # built once for each model
 _poses = lru_cache(maxsize=4)(PoseModel)
-_arc_confidence = lru_cache(maxsize=4)(fit_arc_confidence)  # fitted once for each model
 
 
 def begin_search(
@@ -109,7 +107,7 @@ def begin_search(
     if not len(model.views):
         raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
     wanted = descriptor_for(chosen)
-    if wanted != model.descriptor:
+    if wanted != model.descriptor and not (wanted == BENCH_DESCRIPTOR and model.is_dense):
         raise UsageError(
             f"The strategy {chosen.name!r} needs views by {wanted}; this model has views by {model.descriptor}.",
             next_step=f"Load it with rig.search.model.load_model(catalog, descriptor={wanted!r}), or use another "
@@ -120,11 +118,10 @@ def begin_search(
             return PoseSearch(_poses(model.views), config, chosen, seed=seed, top=top)
         index = _tree(model.views) if config.identify.index == "tree" else model.index
         return HoughSearch(index, config, chosen, seed=seed, top=top)
-    assert model.rule is not None
     if is_in_motion(chosen):
-        session: hbr.DenseSession = ArcSession(model.index, model.rule, _arc_confidence(model.index, model.rule))
+        session: hbr.DenseSession = ArcSession(model.index)
     else:
-        session = hbr.DenseSession(model.index, model.rule, max_views=config.identify.max_views)
+        session = hbr.DenseSession(model.index, max_views=config.identify.max_views)
     return DenseSearch(session, model.views, config, chosen, seed=seed, top=top)
 
 
@@ -132,9 +129,6 @@ def load_model(
     catalog: Catalog, *, descriptor: str | None = None, progress: Callable[[JobProgress], None] | None = None
 ) -> Model:
     """Load the enrolled views, by the bench's own descriptor.
-
-    The stopping rule of the dense search is the one that `rig catalog fit` stored, if it is of this catalog.
-    Otherwise a quick fit makes one (`rig.search.stopping_rules.stopping_rule_of`).
 
     ``descriptor`` is another one, for a strategy of the paper. ``progress`` is called while the program describes views
     that have no description by it.
@@ -152,25 +146,20 @@ def load_model(
     if copied is not None:
         notes = (Note(NoteCode.LOCAL_COPY, {"copied_utc": f"{copied:%Y-%m-%d %H:%M:%S} UTC"}),)
     camera = tuple(sessions.camera_settings(catalog))
-    if not len(views) or views.descriptor != BENCH_DESCRIPTOR:
-        # without views, any search may say that the catalog is empty
-        return Model(hbr.ViewIndex(views if len(views) else hbr.Views.empty()), notes=notes, camera=camera)
-    index = hbr.DenseIndex(views)
-    rule, about_rule = stopping_rule_of(catalog.path, index)
-    notes += about_rule
-    # Were the objects enrolled with an empty-table image, and what does their bench look like?
+    model = Model(_index(views), notes, camera=camera)
+    if not model.is_dense:
+        return model
+    # Were the objects enrolled with an empty-table image?
     before = sessions.empty_tables(catalog)
     with_image = len(before.with_image) >= len(before.without_image)
     others = before.without_image if with_image else before.with_image
     if others:
         notes += (Note(NoteCode.MIXED_EMPTY_TABLE, {"objects": list(others), "with_image": not with_image}),)
-    table = bench_image = None
-    with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
-        if with_image and before.newest is not None:
-            table = bench_image = catalog.read_image(before.newest)
-        elif (view := sessions.newest_view(catalog)) is not None:
-            bench_image = catalog.read_image(view)
-    return Model(index, rule, notes, with_image, camera, table, bench_image, partial(derived.local_views, catalog))
+    table = None
+    if with_image and before.newest is not None:
+        with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
+            table = catalog.read_image(before.newest)
+    return Model(model.index, notes, with_image, camera, table, partial(derived.local_views, catalog))
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:
@@ -179,7 +168,7 @@ def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | Non
     It is the bench's own of today, else the one of the enrollment. It is None if the objects were enrolled without an
     image, because views are compared only with views that were described in the same way.
     """
-    if model.rule is None:
+    if not model.is_dense:
         return None, ()
     status = empty_table_status(bench)
     problems = {"problems": [problem.as_json() for problem in status.problems]}
@@ -194,7 +183,7 @@ def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | Non
 
 @dataclass(eq=False)
 class CurrentModel:
-    """Loads the enrolled views, and again after a change of the catalog or of its stopping rule.
+    """Loads the enrolled views, and again after a change of the catalog.
 
     If the catalog is on a server, it brings the local copy up to date, too. While the server does not answer, the
     loaded model stays in use, with a note about its age. When the server answers again, the catalog replaces the local
@@ -209,7 +198,6 @@ class CurrentModel:
     catalog: Catalog
     descriptor: str | None = None
     version: str = field(default="", init=False)
-    _loaded_state: object = field(default=None, init=False)
     _model: Model | None = field(default=None, init=False)
     _seen: str = field(default="", init=False)
     _server: Catalog | None = field(default=None, init=False)
@@ -231,12 +219,10 @@ class CurrentModel:
         """
         try:
             self._leave_copy()
-            rules = self.catalog.path / FILE
             version = self.catalog.version()
-            state = version, rules.stat().st_mtime_ns if rules.exists() else None
-            if state != self._loaded_state:
+            if version != self.version:
                 self._model = load_model(self.catalog, descriptor=self.descriptor, progress=progress)
-                self._loaded_state, self.version = state, version
+                self.version = version
                 if self.catalog.place.url is not None:
                     with suppress(RigError):  # the copy is for later; the search has its model already
                         update_copy(self.catalog)
@@ -259,4 +245,4 @@ class CurrentModel:
             return
         with suppress(RigError):
             self._server = self._attempts.open(place)
-            self.catalog, self._loaded_state, self.version = self._server, None, ""
+            self.catalog, self.version = self._server, ""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
+from hbr.dense.local_difference import PixelFit
 from hbr.dense.session import Verification, answered
 from rig.core.json_form import plain
 from rig.events.compared import Compared, Verified
@@ -88,7 +89,7 @@ def check(run: SavedRun) -> ReplayCheck:
                 view = describe(event.image_bgr, event.azimuth_deg)
                 if event.evidence.motion is not None:
                     table_deg = event.evidence.motion.angle_deg
-                known = replace(view, segmentation=event.segmentation, same_bench=event.same_bench)
+                known = replace(view, segmentation=event.segmentation, other_bench=event.other_bench)
                 search.add(known, event.azimuth_deg, table_deg=table_deg)
                 found.views += 1
                 if event.segmentation is not None:
@@ -98,7 +99,8 @@ def check(run: SavedRun) -> ReplayCheck:
                 computed = search.changed() or {}
             case Ranked():
                 # The number of candidates is a setting of the run.
-                computed = replace(search.ranked, candidates=search.ranked.candidates[: len(event.candidates)])
+                ranked, _ = search.decide()
+                computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
             case FrameUsed() if search.in_motion:
                 computed = search.frame_used(event.index, event.azimuth_deg, event.seconds, event.rejected)
             case Decided():
@@ -106,7 +108,9 @@ def check(run: SavedRun) -> ReplayCheck:
                 computed = _decided(search, event)
             case Verified():
                 # the enrolled images are not in the run, so their measured fit is used
-                measured = Verification(search.names.index(event.name), event.fit, event.others)
+                measured = Verification(
+                    search.names.index(event.name), PixelFit(event.fit, event.others, event.expected)
+                )
                 computed = answered(search.verify((), measured))
             case Compared():
                 views = saved_enrolled_views(event, search.names)
@@ -128,8 +132,9 @@ def check(run: SavedRun) -> ReplayCheck:
 
 def _decided(search: Search, saved: Decided) -> Decided | dict[str, Any]:
     """Return the event of the computed step; the target angle is the turntable's, not the search's."""
-    if isinstance(search.step, Finish):
-        return {"reason": plain(search.step.reason)}
+    _, step = search.decide()
+    if isinstance(step, Finish):
+        return {"reason": plain(step.reason)}
     computed = search.decided(saved.index, saved.target_deg)
     return replace(computed, candidates=computed.candidates[: len(saved.candidates)])
 

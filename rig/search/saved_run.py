@@ -2,7 +2,7 @@
 
 ``run.json`` contains the conditions and settings, ``model.jsonl`` the enrolled views (one object in each line),
 ``events.jsonl`` the events (one in each line), ``frames/000.png``, ... the accepted frames without loss. The folder of
-a dense search also contains the stopping rule (``search_rules.json``) and the empty-table image (``empty_table.png``).
+a dense search also contains the empty-table image (``empty_table.png``).
 ``leaders/`` has the enrolled views of two candidates that were compared pixel by pixel, as crop and mask.
 
 Decision: docs/decisions/0017.
@@ -33,8 +33,6 @@ from rig.core.next_steps import Do
 from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
 from rig.search.model import Model, empty_table_for, model_of
-from rig.search.stopping_rules import FILE as STOPPING_RULE
-from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
@@ -68,14 +66,11 @@ class RunWriter:
         self._folder = folder
         views = model.views
         kind = descriptor(views.descriptor)
-        started_utc = bench.clock.utc().isoformat()
         with _writing(folder):
             (folder / "frames").mkdir(parents=True, exist_ok=True)
             if len(list(folder.iterdir())) > 1:
                 raise UsageError(f"The folder {folder} is not empty.", next_step="Give a new folder for each run.")
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
-            if model.rule is not None and isinstance(model.index, hbr.DenseIndex):
-                write_stopping_rule(folder / STOPPING_RULE, model.rule, model.index, made_utc=started_utc)
             empty_table, _ = empty_table_for(bench, model)
             if empty_table is not None:
                 write(folder / EMPTY_TABLE, images.encode(empty_table))
@@ -83,7 +78,7 @@ class RunWriter:
                 "format": FORMAT,
                 "version": VERSION,
                 "software": f"hbr-rig {version('hbr-rig')}",
-                "started_utc": started_utc,
+                "started_utc": bench.clock.utc().isoformat(),
                 "bench": bench.name,
                 "devices": bench.devices(),
                 "conditions": dict(bench.conditions),
@@ -155,7 +150,7 @@ class SavedRun:
     config
         The settings of the search.
     model : Model
-        The enrolled views and the stopping rule of the search.
+        The enrolled views of the search.
     empty_table : uint8 array (H, W, 3), or None
         The sheet of empty-table images (`rig.views.table_sheet`).
     error
@@ -250,12 +245,11 @@ def load_run(folder: Path) -> SavedRun:
             raise TypeError("bench, software or started_utc in run.json is not text")
         if not isinstance(about["devices"], dict):
             raise TypeError("devices in run.json is not an object")
-        # The model: enrolled views and stopping rule of the day.
+        # The model: the enrolled views of the day.
         kind = _descriptor(about["descriptor"])
         config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
         views = _views((_object(line) for line in _lines(_bytes(folder, "model.jsonl"))), kind.name)
-        stored = read_stopping_rule(folder)
-        model = model_of(views, rule=None if stored is None else stored.adapted(views))
+        model = model_of(views)
         empty_table = _image(folder, EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
         # The events: a power cut may have cut off the last line.
         content = _bytes(folder, "events.jsonl")

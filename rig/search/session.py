@@ -1,8 +1,9 @@
 """A search without its hardware: views in, ranking and decision out.
 
-A search does no I/O. It takes views (`Search.add`) and says what it needs next: a view after a rotation, or the end. At
-its end (`Search.last_steps`) it asks for enrolled views, and then it answers. The bench at rest and in motion
-(`rig.plans.identify`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
+A search does no I/O. It takes a view (`Search.add`), asks for enrolled views to compare it with (`Search.verify`), and
+says what it needs next (`Search.decide`): a view after a rotation, or the end. After the last view, it may compare its
+two leaders (`Search.compare`), and answers (`Search.answer`). The bench at rest and in motion (`rig.plans.identify`)
+and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
 
 Decision: docs/decisions/0017.
 """
@@ -10,7 +11,6 @@ Decision: docs/decisions/0017.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import isfinite
 from typing import Any, Final
 
 import cv2
@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.core.angles import wrap360
-from hbr.core.arrays import IndexArray
 from hbr.dense.arc import ArcSession
 from hbr.dense.local_difference import LocalView, ViewDifference
 from hbr.dense.pose import pose, poses_of
-from hbr.dense.session import UNKNOWN_BELOW, Asking, LeaderComparison, Queries, Verification
+from hbr.dense.session import Asking, LeaderComparison, Queries, Verification
 from hbr.model.symmetry import symmetry
 from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from rig.config import RigConfig
@@ -160,7 +159,7 @@ class Search(ABC):
     in_motion = False
     """Whether the frames of a rotation are its views."""
     ranked: Ranked
-    """The candidates after the last view."""
+    """The candidates after the last view that was decided on."""
     step: Rotate | Finish | None = None
     """The strategy's last decision."""
     is_new_decision = True
@@ -174,7 +173,9 @@ class Search(ABC):
         self._top = top
         self._rng = np.random.default_rng(seed)
         self._orientations: list[float] = []
+        self._table_deg = 0.0
         self._disturbed = False
+        self._is_decided = True
 
     def notice(self, event: Event) -> None:
         """Take an event that precedes the next view: the table may have moved without a command, as if by hand."""
@@ -186,22 +187,32 @@ class Search(ABC):
             case _:
                 pass
 
-    def add(self, view: DescribedView, azimuth_deg: float, *, table_deg: float) -> tuple[Ranked, Rotate | Finish]:
-        """Add the next view, described by the search's descriptor; return the candidates and the strategy's decision.
+    def add(self, view: DescribedView, azimuth_deg: float, *, table_deg: float) -> None:
+        """Add the next view, described by the search's descriptor.
 
         The azimuth is the orientation of the camera around the object, from any zero that all views share, in [0, 360).
         The table angle is unwrapped.
         """
         self._orientations.append(azimuth_deg)
-        self.ranked = self._rank(view)
-        self._disturbed = False
-        if self.is_new_decision:
-            self.step = self.strategy.next(self._state(table_deg))
+        self._table_deg = table_deg
+        self._add(view)
+        self._disturbed = self._is_decided = False
+
+    def decide(self) -> tuple[Ranked, Rotate | Finish]:
+        """Return the candidates after the last view, and the strategy's decision. A verification counts."""
+        if not self._is_decided:
+            self._is_decided = True
+            self.ranked = self._rank()
+            if self.is_new_decision:
+                self.step = self.strategy.next(self._state(self._table_deg))
         assert self.step is not None
         return self.ranked, self.step
 
     @abstractmethod
-    def _rank(self, view: DescribedView) -> Ranked: ...
+    def _add(self, view: DescribedView) -> None: ...
+
+    @abstractmethod
+    def _rank(self) -> Ranked: ...
 
     @abstractmethod
     def _state(self, table_deg: float) -> SearchState | PoseSearchState | DenseSearchState: ...
@@ -231,12 +242,8 @@ class Search(ABC):
         """Return the event if the last view shows that the object changed; the search has then begun again."""
         return None
 
-    def last_steps(self, hypotheses: Hypotheses) -> tuple[Asking[Verified | None], Asking[Compared | None]]:
-        """Return the steps before the answer: a doubtful leader is verified, then the two leaders are compared."""
-        return self.verify(hypotheses), self.compare(hypotheses)
-
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:  # noqa: ARG002
-        """Verify a doubtful leader, as `hbr.DenseSession.verify`; the answer depends on it."""
+        """Compare the last views with the leader's, as `hbr.DenseSession.verify`; the decision depends on it."""
         return _no_step()
 
     def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:  # noqa: ARG002
@@ -244,7 +251,8 @@ class Search(ABC):
         return _no_step()
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        """Return the answer after the last view and the last steps that were taken."""
+        """Return the answer after the last view, and after the comparison if there was one."""
+        self.decide()
         best = self.ranked.candidates[0]
         end = self.step if isinstance(self.step, Finish) else Finish(hbr.StopReason.MAX_VIEWS)
         return Identified(
@@ -300,8 +308,10 @@ class HoughSearch(Search):
         self._index = index
         self._descriptors: list[NDArray[np.uint8]] = []
 
-    def _rank(self, view: DescribedView) -> Ranked:
+    def _add(self, view: DescribedView) -> None:
         self._descriptors.append(view.levels[self.descriptor])
+
+    def _rank(self) -> Ranked:
         self._queries = queries = np.array(self._descriptors)
         config = self._config.identify
         self._ranking = ranking = hbr.retrieve(
@@ -372,13 +382,15 @@ class PoseSearch(Search):
         self._min_score = _min_score(model.views, config)
         self._reach = np.zeros(len(model.begin))
 
-    def _rank(self, view: DescribedView) -> Ranked:
+    def _add(self, view: DescribedView) -> None:
         similar = self._compared.similarity(view.levels[self.descriptor][None])[0]
         self._so_far = self._belief = update_poses(similar, self._orientations[-1], self._so_far)
+        self._reach += np.maximum.reduceat(similar[self._rows], self._begin)
+
+    def _rank(self) -> Ranked:
         self._objects, log_probability, poses_deg = self._belief.ranking()
         self._probability = np.exp(log_probability)
         # The scores, of the objects in the order of their probabilities.
-        self._reach += np.maximum.reduceat(similar[self._rows], self._begin)
         views = len(self._orientations)
         score = self._reach[np.searchsorted(self._with_views, self._objects)] / views
         numbers = zip(*(each.tolist() for each in (self._objects, score, poses_deg, self._probability)), strict=True)
@@ -436,32 +448,38 @@ class DenseSearch(Search):
         self._session = session
         self.in_motion = isinstance(session, ArcSession)
 
-    def _rank(self, view: DescribedView) -> Ranked:
-        decision = self._session.add(
+    def _add(self, view: DescribedView) -> None:
+        self._session.add(
             view.levels[self.descriptor],
             self._orientations[-1],
             earlier=view.earlier,
             reliable=view.reliable,
-            same_bench=view.same_bench,
-            segmented_by=None if view.segmentation is None else view.segmentation.get("method", ""),
+            other_bench=view.other_bench,
             disturbed=self._disturbed,
         )
         self.is_new_decision = self._session.is_new_decision
-        belief = self._session.belief
-        probability, scores, order = self._ordered()
-        objects = belief.index.object_index.tolist()
-        candidates = tuple(
-            Candidate(self.names[objects[i]], float(scores[i]), poses_of(belief, objects[i])[0], float(probability[i]))
-            for i in order[: self._top].tolist()
-        )
-        others = float(scores[order[1:]].max()) if len(order) > 1 else 0.0
-        return Ranked(len(self._orientations) - 1, candidates, candidates[0].score - others, decision)
 
-    def _ordered(self) -> tuple[NDArray[np.float64], NDArray[np.float64], IndexArray]:
-        """Return probability and score of each object considered, and their order, the likeliest first."""
+    def _rank(self) -> Ranked:
         belief = self._session.belief
-        probability, scores = belief.probability(self._session.rule.beta), belief.scores()
-        return probability, scores, np.lexsort((-scores, -probability))
+        self._scores = belief.scores()
+        self._order = np.lexsort((-self._scores, -belief.probability()))
+        candidates = self._candidates()
+        others = float(self._scores[self._order[1:]].max(initial=0.0))
+        return Ranked(len(self._orientations) - 1, candidates, candidates[0].score - others, self._session.decision)
+
+    def _candidates(self) -> tuple[Candidate, ...]:
+        """Return the leading candidates, the likeliest first, with their shares of the posterior."""
+        belief, probability = self._session.belief, self._probability()
+        found = []
+        for place in self._order[: self._top].tolist():
+            one = int(belief.index.object_index[place])
+            numbers = float(self._scores[place]), poses_of(belief, one)[0], float(probability[place])
+            found.append(Candidate(self.names[one], *numbers))
+        return tuple(found)
+
+    def _probability(self) -> NDArray[np.float64]:
+        """Return the probability of each object considered; what is missing to 1 is that of "not enrolled"."""
+        return self._session.posterior()[0]
 
     def changed(self) -> ObjectChanged | None:
         change = self._session.change
@@ -492,16 +510,16 @@ class DenseSearch(Search):
         found = yield from self._session.verify(self._queries(hypotheses), measured)
         if found is None:
             return None
-        decision = self._session.end()
+        decision = self._session.decision
         return Verified(
             index=len(self._orientations) - 1,
             name=self.names[found.object_index],
-            fit=found.fit,
-            others=found.others,
-            score=found.score(decision.open_set_score),
-            found_from=self._session.found_from,
-            unknown_below=UNKNOWN_BELOW,
+            fit=found.fit.own,
+            others=found.fit.others,
+            expected=found.fit.expected,
             outcome=decision.outcome,
+            probability=decision.probability,
+            not_enrolled=decision.not_enrolled,
         )
 
     def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:
@@ -517,7 +535,7 @@ class DenseSearch(Search):
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
         decision = self._session.end()
-        outcome, threshold = decision.outcome, decision.open_set_threshold
+        outcome = decision.outcome
         compared = decision.reason is hbr.StopReason.LOCAL_DIFFERENCE
         possible = self._leaders() if compared else self._possible(decision)
         found = pose(self._session.belief, decision.object_index)
@@ -528,7 +546,7 @@ class DenseSearch(Search):
             views=self._session.belief.queries,
             left_out=tuple(LeftOut(n, LeftOutReason.OBJECT_CHANGED) for n in range(self._session.left_out)),
             outcome=outcome,
-            reason=decision.reason if compared or self._session.verification else answer.reason,
+            reason=decision.reason if compared else answer.reason,
             possible=possible,
             yaw_deg=yaws_deg[0] if len(yaws_deg) == 1 else None,
             yaw_sigma_deg=found.sigma_deg,
@@ -536,8 +554,7 @@ class DenseSearch(Search):
             period_deg=found.period_deg,
             confidence=decision.probability if outcome is hbr.Outcome.FOUND else None,
             min_confidence=decision.min_confidence,
-            open_set_score=decision.open_set_score,
-            open_set_threshold=threshold if isfinite(threshold) else None,
+            not_enrolled=decision.not_enrolled,
         )
 
     def _leaders(self) -> tuple[str, ...]:
@@ -547,11 +564,14 @@ class DenseSearch(Search):
         return tuple(self.names[one] for one in (found.leaders if found.winner is None else (found.winner,)))
 
     def _possible(self, decision: hbr.StopDecision) -> tuple[str, ...]:
-        """Return the possible objects: of an ambiguous one the likeliest two, or those that reach the confidence."""
+        """Return the possible objects: of an ambiguous one at least the likeliest two.
+
+        With "not enrolled", they reach the confidence together.
+        """
         if decision.outcome is hbr.Outcome.UNKNOWN:
             return ()
-        probability, _, order = self._ordered()
         count = 1
         if decision.outcome is hbr.Outcome.AMBIGUOUS:
-            count = max(2, 1 + int((np.cumsum(probability[order]) < decision.min_confidence).sum()))
-        return tuple(self.names[j] for j in self._session.belief.index.object_index[order[:count]].tolist())
+            together = decision.not_enrolled + np.cumsum(self._probability()[self._order])
+            count = max(2, 1 + int((together < decision.min_confidence).sum()))
+        return tuple(self.names[j] for j in self._session.belief.index.object_index[self._order[:count]].tolist())

@@ -117,9 +117,9 @@ class DenseSearchState(_AnyState):
     Attributes
     ----------
     session : hbr.DenseSession
-        The search, with its ``belief``, its stopping ``rule`` and its method ``next_best_view``.
+        The search, with its ``belief`` and its method ``next_best_view``.
     decision : hbr.StopDecision
-        The stopping rule's decision.
+        What follows from the views so far.
     rotations_deg, seconds : float64 arrays (a,)
         Rotations of the camera around the object that the cable allows, every 5°, and the time of each on this bench.
     """
@@ -164,7 +164,7 @@ class Finish:
 class Strategy(Protocol[State]):
     """Decides after each view.
 
-    A strategy of the dense search also has the attribute ``descriptor``: that of its views, ``edges+colours``. With the
+    A strategy of the dense search also has the attribute ``descriptor``: that of its views. With the
     attribute ``in_motion`` it chooses arcs, on which every frame is a view. A strategy of the hidden Markov model has
     the attribute ``poses``, which is true.
     """
@@ -317,7 +317,7 @@ def to_least_risk(state: PoseSearchState) -> Rotate:
 
 @dataclass(frozen=True)
 class DenseStrategy:
-    """The bench's own: rotates to the next best view, motion time included, until the stopping rule ends the search.
+    """The bench's own: rotates to the next best view, motion time included, until an answer is probable enough.
 
     In motion it rotates along the most informative arc, and decides again while the table rotates.
     """
@@ -336,7 +336,7 @@ class DenseStrategy:
         if best.pair is not None:
             reason = RotationReason.SEPARATES_CANDIDATES
         else:  # the strongest hypotheses are poses of one object, but the others together may be as likely
-            _, leading = state.session.belief.likeliest(state.session.rule.beta)
+            _, leading = state.session.belief.likeliest()
             reason = RotationReason.NEW_SIDE if leading >= ALONE else RotationReason.SEVERAL_POSES
         return Rotate(
             best.rotation_deg,

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
+from hbr.descriptors import best
+from hbr.descriptors.registry import FULL, LIGHT
 from hbr.descriptors.together import LearnedBackground
 from hbr.segmentation import MIN_AGREEMENT, BoxMethod, Issue, IssueCode
 from hbr.segmentation.background import SegmentedFrame
@@ -23,8 +25,11 @@ from rig.views.table_sheet import TableSheet, table_image
 
 PAPER_DESCRIPTOR: Final = "cedd"
 """The paper's descriptor. It describes the whole region of interest, with the background."""
-BENCH_DESCRIPTOR: Final = "edges+colours"
-"""The rig's own descriptor. It describes only the object, with corrected illumination."""
+BENCH_DESCRIPTOR: Final = best()
+"""The rig's own descriptor, with the network if its weights are installed. It describes only the object, with corrected
+illumination."""
+DENSE_DESCRIPTORS: Final = (LIGHT, FULL)
+"""The descriptors of the dense search: a run may come from a computer without the network."""
 DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
 IN_A_ROW: Final = 3
@@ -62,8 +67,8 @@ class DescribedView:
         In a search: the levels of all earlier views, which were segmented again; a row for each segmentation.
     reliable
         In a search: whether the view was segmented by a known background (`hbr.ViewsTogether.reliable`).
-    same_bench
-        In a search: whether the bench is that of the enrollment; None: not known.
+    other_bench
+        In a search: whether the bench is certainly not that of the enrollment.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
@@ -71,7 +76,7 @@ class DescribedView:
     table_problem: TableProblem | None = None
     earlier: tuple[NDArray[np.uint8], ...] | None = None
     reliable: bool = True
-    same_bench: bool | None = None
+    other_bench: bool = False
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -214,7 +219,7 @@ class SearchDescriber(ViewDescriber):
     (`hbr.ViewsTogether`). The levels have a row for each segmentation.
 
     With ``revise`` earlier views are segmented again with each new one; not in a search in motion, which has many
-    views. The first frame is compared with ``bench_image``, an image or a `TableSheet` of the bench of the enrollment.
+    views. The empty-table image is compared with that of the enrollment, ``enrolled_table``.
     """
 
     def __init__(
@@ -224,13 +229,14 @@ class SearchDescriber(ViewDescriber):
         empty_table: NDArray[np.uint8] | None = None,
         *,
         revise: bool = True,
-        bench_image: NDArray[np.uint8] | None = None,
+        enrolled_table: NDArray[np.uint8] | None = None,
     ) -> None:
         super().__init__(config, (name,), empty_table)
         self._name = name
         self._revise = revise
-        self._bench_image = bench_image
-        self._same_bench: bool | None = None
+        self._enrolled_table = enrolled_table
+        self._table = empty_table
+        self._other_bench = False
         self._views: hbr.ViewsTogether | None = None
 
     @property
@@ -246,16 +252,18 @@ class SearchDescriber(ViewDescriber):
         background, issues = self._prepared_table(image_bgr, azimuth_deg)
         if self._views is None:
             self._views = hbr.ViewsTogether(self._name)
-            bench_bgr = table_image(self._bench_image, image_bgr, azimuth_deg)
-            if bench_bgr is not None:
-                self._same_bench = hbr.Background(within(bench_bgr, self.region)).shows_same_bench(part)
         found = self._views.add(part, background, revise=self._revise, keep=self._revise)[0]
+        if len(self._views.segmentations) == 1:
+            before, now = (table_image(one, image_bgr, azimuth_deg) for one in (self._enrolled_table, self._table))
+            if before is not None and now is not None:
+                table = hbr.Background(within(before, self.region))
+                self._other_bench = table.shows_another_bench(within(now, self.region))
         found = replace(found, issues=(*issues, *found.issues))
         *earlier, levels = self._views.levels
         problem = self._table_problem(found.agreement)
         revised = tuple(earlier) if self._revise else None
         return DescribedView(
-            {self._name: levels}, found.evidence(), problem, revised, self._views.reliable, self._same_bench
+            {self._name: levels}, found.evidence(), problem, revised, self._views.reliable, self._other_bench
         )
 
 

@@ -2,11 +2,10 @@
 
 from typing import ClassVar
 
-from hbr import StopDecision
-from rig.core.phrases import azimuth_words, distinct, signed
-from rig.events.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
+from rig.core.phrases import azimuth_words, distinct, percent_words, signed
+from rig.events.events import Accepted, Decided, Event, Identified, Moved, Ranked
 from rig.events.lines import line
-from rig.events.wording import share_words
+from rig.events.wording import NOT_ENROLLED, share_words
 
 
 def _row(view: object, azimuth: str, rotation: tuple[str, str, str], similarity: tuple[str, str], rest: str) -> str:
@@ -32,8 +31,7 @@ class MoveLines:
         self._rest_deg = 0.0
         self._move: Moved | None = None
         self._azimuth_deg = 0.0
-        self._leading: tuple[Candidate, ...] = ()
-        self._decision: StopDecision | None = None
+        self._ranked: Ranked | None = None
 
     def add(self, event: Event) -> str:
         """Take the next event; return the line that it completes, or an empty string."""
@@ -44,7 +42,7 @@ class MoveLines:
             case Accepted():
                 self._azimuth_deg = event.azimuth_deg
             case Ranked():
-                self._leading, self._decision = event.candidates[:3], event.decision
+                self._ranked = event
             case Decided():
                 text = self._line(event)
                 self._asked_deg = event.target_deg - self._rest_deg
@@ -73,7 +71,10 @@ class MoveLines:
             there = weighed[decided.weighed.rotations_deg.index(decided.rotation_deg)]
             similarity = f"{there:.2f}", f"{min(weighed):.2f}–{max(weighed):.2f}"
         goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
-        leading = ", ".join(f"{c.name} {share_words(c, self._decision) or f'{c.score:.3f}'}" for c in self._leading)
+        assert self._ranked is not None
+        leading = ", ".join(f"{c.name} {share_words(c) or f'{c.score:.3f}'}" for c in self._ranked.candidates[:3])
+        if self._ranked.decision is not None:
+            leading += f", {NOT_ENROLLED} {percent_words(self._ranked.decision.not_enrolled)}"
         note = "" if move.agrees else "  encoder and IMU differ"
         azimuth = f"{azimuth_words(self._azimuth_deg)}°"
         return _row(move.index + 1, azimuth, rotation, similarity, f"{goes:<12}{leading}{note}")

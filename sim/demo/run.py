@@ -332,7 +332,7 @@ def _identify(
         if say and (text := moves.add(event)):
             print(text, flush=True)
         if say and isinstance(event, Started):
-            print(MoveLines.HEADING if model.rule is None else MoveLines.DENSE_HEADING)
+            print(MoveLines.DENSE_HEADING if model.is_dense else MoveLines.HEADING)
     return record
 
 

@@ -1,37 +1,25 @@
-"""`rig catalog verify`, `redescribe`, `gc`, `copy`, `deliver` and `fit`: the catalog as a whole.
+"""`rig catalog verify`, `redescribe`, `gc`, `copy` and `deliver`: the catalog as a whole.
 
 Decision: docs/decisions/0010.
 """
 
-import os
 import sys
-from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
 from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_CATALOG
-from rig.cli.ui.jobs import interruptible, run_job, size_words
+from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.options import ClusterOption, JobsOption, YesOption, jobs_of
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
-from rig.core.errors import CatalogError, UsageError
-from rig.core.next_steps import Do
-from rig.core.phrases import counted, percent, percent_words, sentence
+from rig.core.errors import UsageError
+from rig.core.phrases import counted
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from hbr import FittedRule
-    from hbr.core.arrays import FloatArray
-    from hbr.dense.leave_one_out import Task
-
-_SEVERAL_PROCESSES: Final = 20_000
-"""Views from which the searches of a fit take longer than the start of further processes."""
 _SHOWN: Final = 20
 """Failed objects that are listed; --json has all."""
 
@@ -80,7 +68,7 @@ def redescribe(
 
     Example: rig catalog redescribe --region 40,0,240,240 --bench sim
 
-    Example: rig catalog redescribe --descriptor edges+colours --bench sim
+    Example: rig catalog redescribe --descriptor edges+colours+cedd --bench sim
     """
     from rig.catalog.derived import choose_region
     from rig.catalog.derived import redescribe as job
@@ -229,98 +217,3 @@ def deliver(
         print("No object was delivered.")
     if conflicts:
         raise typer.Exit(EXIT_CATALOG)
-
-
-@app.command("fit")
-@app.command("calibrate", hidden=True)  # the word that technicians try first
-@command
-def fit(
-    settings: Settings,
-    error_rate: Annotated[
-        float | None,
-        typer.Option(min=0.0001, max=0.5, help="Largest share of wrong objects among those named (default: 1 %)."),
-    ] = None,
-    false_reject: Annotated[
-        float | None,
-        typer.Option(min=0.0001, max=0.5, help="Largest share of enrolled objects called unknown (default: 2 %)."),
-    ] = None,
-    cluster: ClusterOption = None,
-) -> None:
-    """Fit the stopping rule, which decides when rig identify ends a search, to the catalog.
-
-    The command searches for each enrolled object with its own views, as if the camera had been a little to the side.
-    Then it leaves the object out and searches again, as for an unknown object. In a catalog of more than 1000 objects,
-    it searches for 1000 of them among all. It reports what the rule cannot guarantee, and how much more data is needed.
-    Repeat the command when rig identify reports that the catalog has changed.
-
-    Example: rig catalog fit --bench sim --error-rate 0.005
-    """
-    from hbr import DenseIndex, fit_stopping_rule
-    from hbr.dense.fitting import ERROR_RATE, FALSE_REJECT
-    from rig.catalog.derived import views as enrolled_views
-    from rig.catalog.jobs import JobProgress
-    from rig.cli.ui.present import ProgressBar
-    from rig.core.json_form import plain
-    from rig.core.processes import map_in_processes
-    from rig.search.stopping_rules import FILE, stopping_rule_values, write_stopping_rule
-    from rig.views.description import BENCH_DESCRIPTOR
-
-    clock = SystemClock()
-    with settings.open_catalog(read_only=True) as catalog:
-        with ProgressBar("Describing the enrolled views") as progress:
-            views = enrolled_views(catalog, BENCH_DESCRIPTOR, progress)
-        if not len(views):
-            raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
-        path = catalog.path / FILE
-    print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
-    # Processes take their time to start: a small catalog is faster in one.
-    index = DenseIndex(views)
-    where = jobs_of(None, cluster) or ((os.cpu_count() or 1) if len(views) >= _SEVERAL_PROCESSES else 1)
-    with interruptible("Interrupted; nothing changed."), ProgressBar("Searching") as progress:
-
-        def searched(
-            work: "Callable[[Task], FloatArray]", tasks: "Sequence[Task]"
-        ) -> "Iterator[tuple[Task, FloatArray]]":
-            for done, one in enumerate(map_in_processes(work, tasks, where)):
-                progress(JobProgress(done, len(tasks)))
-                yield one
-
-        found = fit_stopping_rule(
-            index, error_rate=error_rate or ERROR_RATE, false_reject=false_reject or FALSE_REJECT, tasks=searched
-        )
-    made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
-    write_stopping_rule(path, found.rule, index, made_utc=made_utc)
-    outcome = {key: value for key, value in plain(found).items() if key != "rule"}
-    values = stopping_rule_values(found.rule, index, made_utc=made_utc)
-    words = "\n".join([*_fit_lines(found, len(views.object_names)), f"Stored: {path}"])
-    settings.say(words, {"file": str(path), "fit": outcome, **values})
-
-
-def _fit_lines(found: "FittedRule", objects: int) -> list[str]:
-    from rig.events.wording import limitation_words
-
-    rule = found.rule
-    searched = (f"{found.searched} of " if 0 < found.searched < objects else "") + counted(objects, "object")
-    lines = [f"{rule.searches} leave-one-out searches of {counted(found.views, 'view')} for {searched}"]
-    if found.ended:
-        lines.append(
-            f"  answers  {found.ended} searches ended at a confidence of {percent_words(rule.min_confidence)}, after "
-            f"{found.mean_views:.2f} views on average, {found.wrong} of them with a wrong object "
-            f"({percent(found.wrong / found.ended)})"
-        )
-    if isfinite(rule.open_set_thresholds[-1]):
-        thresholds = ", ".join(f"{one:.3f}" for one in rule.open_set_thresholds)
-        share = f": {found.rejected} of {rule.searches} searches for enrolled objects" if found.ended else ""
-        lines.append(f"  unknown  below an open-set score of {thresholds} after 1, 2, ... views{share}")
-    if found.accepted is not None:
-        pairs = ", ".join(f"{one} for {other}" for one, other in found.confused[:3])
-        lines.append(
-            f"  left out  {found.accepted} of {rule.searches} left-out objects were taken for another object "
-            f"({percent(found.accepted / rule.searches)}){f': {pairs}' if pairs else ''}"
-        )
-    if not rule.limitations:
-        lines.append(
-            f"Guaranteed for searches like these: at most {percent(rule.error_rate)} wrong answers, and "
-            f"{percent(rule.false_reject)} of the enrolled objects called unknown."
-        )
-    return [*lines, *(f"Not guaranteed: {sentence(limitation_words(one))}" for one in rule.limitations)]

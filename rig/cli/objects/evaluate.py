@@ -46,7 +46,7 @@ def evaluate(
         ),
     ] = None,
     descriptor: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Descriptor of the views: cedd, edges+colours, ...")
+        str | None, typer.Option(metavar="NAME", help="Descriptor of the views: cedd, edges+colours+cedd, ...")
     ] = None,
     orientation_errors: Annotated[
         str | None,

@@ -53,8 +53,8 @@ def identify(
     The exit code is 0 if it is found, 6 if the table is empty, 8 if it is unknown, 10 if it is ambiguous.
 
     Put the object on the table in any orientation. The default strategy, dense, compares views by edges and colours,
-    rotates to the next best view, and stops by the stopping rule (rig catalog fit). The paper's is ahbr, by CEDD; its
-    successor, the hidden Markov model hmm, stops at a probability of 98 %.
+    rotates to the next best view, and stops when the object, or "not enrolled", is probable enough. The paper's is
+    ahbr, by CEDD; its successor, the hidden Markov model hmm, stops at a probability of 98 %.
 
     The catalog records each answer (rig results list).
 

@@ -15,10 +15,9 @@ from rich.text import Text
 
 from rig.cli.ui.keys import HINT, Pause
 from rig.config import RigConfig
-from rig.core.phrases import angle_words, azimuth_words, counted, duration_words, percent, signed
+from rig.core.phrases import angle_words, azimuth_words, counted, duration_words, percent, percent_words, signed
 from rig.events.events import (
     Accepted,
-    Candidate,
     Decided,
     Enrolled,
     Event,
@@ -32,7 +31,14 @@ from rig.events.events import (
     Waiting,
 )
 from rig.events.lines import line
-from rig.events.wording import decision_words, move_words, ranking_words, share_words, similar_objects_words
+from rig.events.wording import (
+    NOT_ENROLLED,
+    decision_words,
+    move_words,
+    ranking_words,
+    share_words,
+    similar_objects_words,
+)
 from rig.motion.move import MotionTimes
 from rig.plans.estimate import TimeLeft
 from rig.views.capture import ViewEvidence, rejection_text
@@ -282,6 +288,10 @@ class EnrollView(LiveView):
         return Group(table, bar, *state) if self._rows else Group(bar, *state)
 
 
+def _bar(share: float) -> ProgressBar:
+    return ProgressBar(total=1.0, completed=max(0.0, min(1.0, share)), width=24, complete_style="cyan")
+
+
 class IdentifyView(LiveView):
     """The candidates after each view, and the decisions.
 
@@ -349,10 +359,7 @@ class IdentifyView(LiveView):
         if self._ranked is None:
             return ""
         best = self._ranked.candidates[0]
-        return f"{best.name} {self._share(best) or signed(self._ranked.margin, 3)}"
-
-    def _share(self, one: Candidate) -> str:
-        return share_words(one, self._ranked.decision if self._ranked else None)
+        return f"{best.name} {share_words(best) or signed(self._ranked.margin, 3)}"
 
     @property
     def _decision(self) -> str:
@@ -366,7 +373,7 @@ class IdentifyView(LiveView):
             table.add_column(heading, justify="right")
         candidates = self._ranked.candidates if self._ranked else ()
         # The paper's search has no probabilities, and a narrow terminal no room for bars.
-        shares = [self._share(one) for one in candidates]
+        shares = [share_words(one) for one in candidates]
         likely = any(shares)
         if likely:
             table.add_column("probability", justify="right")
@@ -385,10 +392,11 @@ class IdentifyView(LiveView):
             ]
             if wide:
                 share = one.score if not words or one.probability is None else one.probability
-                cells.append(
-                    ProgressBar(total=1.0, completed=max(0.0, min(1.0, share)), width=24, complete_style="cyan")
-                )
+                cells.append(_bar(share))
             table.add_row(*cells)
+        if self._ranked is not None and self._ranked.decision is not None:
+            share = self._ranked.decision.not_enrolled
+            table.add_row("", NOT_ENROLLED, "", "", "", percent_words(share), *([_bar(share)] if wide else []))
         if self._ended:
             return table if candidates else Group()
         # Below the table: where the search is, and its last decision.

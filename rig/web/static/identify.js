@@ -19,13 +19,14 @@ export function noAnswer(error) {
 }
 
 function clear() {
-  for (const id of ["steps", "candidates", "shares"]) $(id).replaceChildren();
+  for (const id of ["steps", "candidates"]) $(id).replaceChildren();
   answer("Searching …", "", "");
 }
 
 /** Show the chart of the candidates after a number of views. The server draws it; its words are for screen readers. */
-function chart(job, views, candidates) {
+function chart(job, views, candidates, notEnrolled) {
   const words = candidates.map((one) => `${one.name} ${one.probability === null ? number(one.score, 3) : percent(one.probability)}`);
+  if (typeof notEnrolled === "number") words.push(`not enrolled ${percent(notEnrolled)}`);
   $("candidates").replaceChildren(h("img", { src: `${API}/jobs/${job}/candidates?views=${views}`, alt: words.join(", ") }));
 }
 
@@ -34,15 +35,14 @@ export function result(event) {
   if (event.outcome === "found") answer(event.name, "found", ...lines);
   else if (event.outcome === "ambiguous") answer(event.possible.join(" or "), "ambiguous", ...lines);
   else answer("Unknown object", "unknown", ...lines);
-  chart(event.job, event.views, event.candidates);
-  $("shares").textContent = event.outcome === "unknown" ? "The object on the table is none of them." : "";
+  chart(event.job, event.views, event.candidates, event.not_enrolled);
 }
 
 on("shown-plan", (event) => {
   if (event.event === "frame_used") return answer("Searching …", "", event.text.trim());
   if (event.event === "started") clear();
   if (event.event === "waiting") answer(event.reason === "first-object" ? "Put an object on the table" : "Put the next object on the table", "", "");
-  if (event.event === "ranked") chart(event.job, event.index + 1, event.candidates);
+  if (event.event === "ranked") chart(event.job, event.index + 1, event.candidates, event.decision?.not_enrolled);
   if (event.event === "identified") return result(event);
   if (event.event === "failed") noAnswer(event);
   if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
