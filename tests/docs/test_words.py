@@ -85,7 +85,6 @@ EXCEPTIONS: dict[str, tuple[str, ...]] = {
     "docs/reference/glossary.md": RETIRED,  # it lists them
     "docs/reference/style.md": (r"anew", r"anyhow"),  # examples of what not to write
     "tests/docs/test_words.py": RETIRED,
-    "hbr/evaluation/unknown_objects.py": (r"strangers?",),  # the name of a random stream: another draws other objects
     "tests/rig/catalog/test_upkeep.py": (r"somebody|nobody|anybody",),  # a user of the operating system
 }
 """Files that may use some of these terms."""

@@ -24,7 +24,6 @@ COMMANDS = {
     "delete": ("catalog", "delete", "lamp", "--yes"),
     "gc": ("catalog", "gc", "--yes"),
     "redescribe": ("catalog", "redescribe", "--descriptor", "edges", "--jobs", "1"),
-    "calibrate": ("catalog", "fit"),
     "verify": ("catalog", "verify"),
     "configuration": ("config", "set", "identify.max_views", "5"),
     "tray": ("enroll", "--list", "tray.csv", "--yes"),

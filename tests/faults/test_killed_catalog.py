@@ -19,6 +19,7 @@ from rig.catalog.results import find_results
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
+from rig.views.description import BENCH_DESCRIPTOR
 from tests.faults.catalog_work import WORK, opened, prepare, run
 from tests.programs import Program
 from tests.rig.catalog.catalog_samples import without_waiting
@@ -53,7 +54,7 @@ def state(home: Path) -> dict[str, Any]:
             }
             found[name]["deleted"] = [one.name for one in catalog.objects(deleted=True)]
             found[name]["results"] = [(one.answered, len(one.corrections)) for one in find_results(catalog)]
-            views = derived.views(catalog, "edges+colours")
+            views = derived.views(catalog, BENCH_DESCRIPTOR)
             found[name]["searched"] = (views.object_names, views.descriptors.tolist())
     return found
 

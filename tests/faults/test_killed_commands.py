@@ -25,7 +25,7 @@ roi = [40, 0, 240, 240]
 """
 KILLS = int(os.environ.get("RIG_TEST_KILLS", "1"))
 """Kills of each command; `make test-kills` asks for more."""
-SIMILAR = ("photographs", "merge", "delete", "gc", "calibrate", "verify")
+SIMILAR = ("photographs", "merge", "delete", "gc", "verify")
 """Commands that store their work as others do; with one kill, only the nightly tests run them."""
 
 Rig = Callable[..., Result]

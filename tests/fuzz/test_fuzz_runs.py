@@ -19,7 +19,7 @@ from tests.rig.search.run_samples import saved_runs
 
 pytestmark = pytest.mark.timeout(7200)
 
-FILES = ["run.json", "events.jsonl", "model.jsonl", "search_rules.json", "frames/000.png", "empty_table.png"]
+FILES = ["run.json", "events.jsonl", "model.jsonl", "frames/000.png", "empty_table.png"]
 EVIL = [
     *(None, True, -1, 0, 10**12, 10**400, 1e308, -1e308, 1e-320, "", "a", [], {}, [[]], [None], {"": None}),
     *("\x1b[2J", "\u202e", "../../outside/secret.txt", "onnx:/dev/zero", "onnx:../../outside/secret.txt", "0" * 300),

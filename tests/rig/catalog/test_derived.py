@@ -13,6 +13,7 @@ from sqlalchemy import delete, insert, select, update
 
 import hbr
 from hbr.descriptors import network
+from hbr.descriptors.registry import FULL
 from rig.catalog import Catalog, Enrollment, derived, describing
 from rig.catalog.describing import SEGMENTATION
 from rig.catalog.facts import Derived, seal_of
@@ -30,7 +31,7 @@ from rig.views.description import (
     SegmentationSummary,
 )
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, OpenCatalog, forget, plan, record, sql, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, forget, plan, record, sql, without_waiting
 
 REGION = (8, 0, 64, 64)
 VIEWS = 4
@@ -289,7 +290,7 @@ def test_an_object_whose_image_is_missing_is_named(catalog: Catalog) -> None:
 def test_a_catalog_with_learned_descriptions_is_searched_without_the_weights(
     catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learned = "edges+colours+network"
+    learned = FULL
     with monkeypatch.context() as patch:
         patch.setattr(network, "weights_file", lambda: Path("weights"))
         patch.setattr(network, "_NET", lambda planes: planes[:, :1, 105:119, 105:119].repeat(112, axis=1))
@@ -356,19 +357,7 @@ def test_one_object_without_a_description_does_not_change_the_method(catalog: Ca
     after = load_model(catalog)
     assert after.descriptor == before.descriptor == BENCH_DESCRIPTOR
     assert equal(before.views, after.views)
-    assert after.rule is not None
-
-
-def test_search_compares_the_bench_with_the_newest_enrollment(open_catalog: OpenCatalog) -> None:
-    catalog = open_catalog("new")
-    enroll(catalog, "box", empty_table=False)
-    enroll(catalog, "can", empty_table=False)
-    model = load_model(catalog)
-    assert model.empty_table is None
-    assert model.bench_image is not None
-    assert np.array_equal(model.bench_image, view(0))
-    catalog.image_path(catalog.object("can").views[0].image).unlink()
-    assert load_model(catalog).bench_image is None
+    assert after.is_dense
 
 
 def test_a_changed_empty_table_image_is_found_and_not_used(catalog: Catalog) -> None:

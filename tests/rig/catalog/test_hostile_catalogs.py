@@ -30,6 +30,7 @@ from rig.core.errors import CatalogDamaged, RigError
 from rig.core.files import write
 from rig.core.next_steps import Do
 from rig.views import image_files as images
+from rig.views.description import BENCH_DESCRIPTOR
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
     PROVENANCE,
@@ -144,10 +145,9 @@ def move(catalog: Catalog, folder: Path) -> None:
 
 
 def answer(catalog: Catalog, _: Path) -> None:
-    derived.views(catalog, "edges+colours")
+    derived.views(catalog, BENCH_DESCRIPTOR)
     sessions.camera_settings(catalog)
     sessions.empty_tables(catalog)
-    sessions.newest_view(catalog)
     derived.described_regions(catalog, "bench-1")
     derived.local_views(catalog, "mug", [0.0])
 
@@ -515,10 +515,9 @@ SHOWN: dict[str, Callable[[Catalog], Any]] = {
         ]
     ),
     "identify": lambda catalog: (
-        derived.views(catalog, "edges+colours").object_names,
-        derived.views(catalog, "edges+colours").azimuth_deg.tolist(),
+        derived.views(catalog, BENCH_DESCRIPTOR).object_names,
+        derived.views(catalog, BENCH_DESCRIPTOR).azimuth_deg.tolist(),
         sessions.empty_tables(catalog).newest,
-        sessions.newest_view(catalog),
     ),
     "export": lambda catalog: ascii(
         [

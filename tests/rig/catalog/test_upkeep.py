@@ -15,6 +15,7 @@ from rig.catalog.upkeep import YOUNG_S, collect_garbage, statistics
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
 from rig.core.next_steps import Do
+from rig.views.description import DESCRIPTORS
 from rig.views.image_files import encode
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, files, fill, finished, image, new_result, plan, record
@@ -208,6 +209,5 @@ class TestGarbage:
         assert found.image_bytes + found.result_image_bytes == sizes
         assert found.log_entries == len(catalog.log())
         assert [(kind.name, kind.views, kind.current) for kind in found.descriptors] == [
-            ("cedd", 6, True),
-            ("edges+colours", 6, True),
+            (name, 6, True) for name in DESCRIPTORS
         ]

@@ -11,7 +11,6 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hbr.dense.fitting import ERROR_RATE, FALSE_REJECT
 from rig.cli.main import SECTIONS, _with_commands_for, app
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.core.errors import RigError
@@ -127,9 +126,3 @@ def test_help_begins_with_the_ten_commands_of_a_day_and_names_every_command_once
     assert len(SECTIONS["Start here"]) == 10
     listed = re.findall(r"^  ([a-z][a-z-]+) +[A-Z]", shown, re.MULTILINE)
     assert listed == [name for names in SECTIONS.values() for name in names]
-
-
-def test_help_names_the_error_rates_that_are_allowed():
-    shown = " ".join(CliRunner().invoke(app, ["catalog", "fit", "--help"], env={"COLUMNS": "200"}).output.split())
-    for rate in (ERROR_RATE, FALSE_REJECT):
-        assert f"(default: {100 * rate:g} %)" in shown

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import fields, is_dataclass
-from math import inf
 from typing import Any, get_args
 
 import pytest
@@ -162,10 +161,10 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     sides = ((0.0,), (10.0, 20.0))
     shown = (ComparedView(2, 0.9, 5000.0),)
     seen.add(check_event(Compared(3, ("a", "b"), "a", 0.9, (1.0, -1.0), 0.01, 0.01, 0.1, 0.2, 1.5, shown, sides)))
-    decision = StopDecision(hbr.Outcome.FOUND, hbr.StopReason.CONFIDENT, 0, 0.99, 0.98, 1.0, -inf)  # none is unknown
+    decision = StopDecision(hbr.Outcome.FOUND, hbr.StopReason.CONFIDENT, 0, 0.99, 0.004, 0.97)
     seen.add(check_event(Ranked(3, (Candidate("dice", 0.9, 30.0, 0.99),), 0.2, decision)))
     seen.add(check_event(ObjectChanged(3, 2, 7.5, 3.0)))
-    seen.add(check_event(Verified(3, "dice", 0.7, 0.4, 1.2, 0.0, -1.3, hbr.Outcome.FOUND)))
+    seen.add(check_event(Verified(3, "dice", 0.7, 0.4, 0.8, hbr.Outcome.FOUND, 0.99, 0.004)))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == KINDS.keys()
 

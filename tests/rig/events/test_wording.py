@@ -1,14 +1,12 @@
 """Codes of events in words. Other tests assert the codes."""
 
 from dataclasses import replace
-from math import inf
 
 import pytest
 
 from hbr import Outcome, StopDecision, StopReason
-from hbr.dense.stopping import Limitation, LimitationCode
 from rig.core.next_steps import Do, steps_as_json
-from rig.events.compared import Compared, ComparedView
+from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import (
     Candidate,
     Decided,
@@ -17,6 +15,7 @@ from rig.events.events import (
     Moved,
     Note,
     NoteCode,
+    Ranked,
     RotationReason,
     SimilarObject,
     SimilarObjects,
@@ -28,7 +27,6 @@ from rig.events.wording import (
     answer_words,
     comparison_words,
     decision_words,
-    limitation_words,
     move_words,
     note_steps,
     note_words,
@@ -38,6 +36,7 @@ from rig.events.wording import (
     similar_object_words,
     similar_objects_words,
     stop_words,
+    verification_words,
     wait_words,
 )
 from tests.rig.report.report_samples import NAMES, NOTE, identified
@@ -86,12 +85,7 @@ def test_dense_decisions_name_the_two_candidates() -> None:
 @pytest.mark.parametrize(
     ("outcome", "reason", "words"),
     [
-        (
-            Outcome.FOUND,
-            StopReason.CONFIDENT,
-            "the confidence 97.0 % reaches 95.0 %, and the open-set score is 0.100",
-        ),
-        (Outcome.FOUND, StopReason.UNCHANGED_BENCH, "the confidence 97.0 % reaches 95.0 %, and the open-set score is"),
+        (Outcome.FOUND, StopReason.CONFIDENT, "the confidence 97.0 % reaches 95.0 %"),
         (
             Outcome.AMBIGUOUS,
             StopReason.MAX_VIEWS,
@@ -99,14 +93,11 @@ def test_dense_decisions_name_the_two_candidates() -> None:
         ),
         (Outcome.CONTINUE, StopReason.BADLY_SEGMENTED, "the background is not known yet; another view shows it"),
         (Outcome.CONTINUE, StopReason.NOT_CONFIDENT, "not confident yet: 97.0 %, and 95.0 % ends the search"),
-        (Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD, "the open-set score is still 0.100 below its"),
-        (Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD, "no enrolled object is similar enough: the open-set"),
+        (Outcome.UNKNOWN, StopReason.NOT_ENROLLED, "not enrolled with 2.0 %"),
     ],
 )
 def test_stop_decisions_give_their_numbers(outcome: Outcome, reason: StopReason, words: str) -> None:
-    decision = StopDecision(outcome, reason, 0, 0.97, 0.95, 1.0, 0.9)
-    assert stop_words(decision, 3).startswith(words)
-    assert "inf" not in stop_words(replace(decision, reason=StopReason.CONFIDENT, open_set_threshold=-inf), 3)
+    assert stop_words(StopDecision(outcome, reason, 0, 0.97, 0.02, 0.95), 3).startswith(words)
 
 
 def test_answers_begin_with_the_result() -> None:
@@ -127,6 +118,7 @@ def test_answers_begin_with_the_result() -> None:
     assert answer_words(replace(doubtful, possible=tuple("abcdefg"))).startswith(
         "Ambiguous: a, b, c, d, e or 2 more (4"
     )
+    assert "mug-white, mug-star or not enrolled (30.0 %)" in answer_words(replace(doubtful, not_enrolled=0.3))
     likely = tuple(replace(one, probability=0.4) for one in doubtful.candidates)
     assert "mug-white (40.0 %) or mug-star (40.0 %)" in answer_words(replace(doubtful, candidates=likely))
     assert outcome_words(doubtful) == "mug-white or mug-star"
@@ -146,7 +138,7 @@ def test_end_of_a_search_has_a_reason() -> None:
     assert reason_words(by_probability) == "the search took all 4 views that are allowed"
     assert reason_words(replace(known, reason=StopReason.NO_ROTATION_LEFT)) == "the cable allows no other view"
     assert reason_words(replace(known, reason=StopReason.CUSTOM, note="enough")) == "enough"
-    dense = replace(known, confidence=0.6, min_confidence=0.95, open_set_score=1.0, open_set_threshold=None)
+    dense = replace(known, confidence=0.6, min_confidence=0.95, not_enrolled=0.3)
     assert reason_words(replace(dense, reason=StopReason.MAX_VIEWS)).startswith("the best candidate after 4 views")
     assert reason_words(replace(dense, reason=StopReason.CONFIDENT)) == "the confidence 60.0 % reaches 95.0 %"
     likely = tuple(replace(one, probability=0.4) for one in dense.candidates)
@@ -156,16 +148,27 @@ def test_end_of_a_search_has_a_reason() -> None:
     assert reason_words(doubtful).endswith("with a probability of 40.0 % below 95.0 %")
 
 
-def test_shares_of_candidates_are_no_confidence_in_an_unknown_object() -> None:
+def test_unknown_object_has_the_probability_that_it_is_not_enrolled() -> None:
     unknown = identified(None).answer
     assert isinstance(unknown, Identified)
     assert "Percentages" not in answer_words(unknown)  # the paper's search has none
     likely = tuple(replace(one, probability=0.997) for one in unknown.candidates)
-    dense = replace(unknown, candidates=likely, reason=StopReason.BELOW_OPEN_SET_THRESHOLD)
-    assert answer_words(dense).endswith("Percentages of candidates are shares among the enrolled objects.")
+    by_probability = replace(unknown, candidates=likely)  # a hidden Markov model
+    assert answer_words(by_probability).endswith("Percentages of candidates are shares among the enrolled objects.")
+    dense = replace(by_probability, not_enrolled=0.97, reason=StopReason.NOT_ENROLLED)
+    assert answer_words(dense).endswith("(score 0.730). Not enrolled with 97.0 %.")
     frame = FrameUsed(3, 30.0, 1.0, 0, "mug-white", 0.997, Outcome.UNKNOWN)
-    assert line(frame).startswith("  in motion: mug-white, resembles no enrolled object enough; view 4")
+    assert line(replace(frame, probability=0.001)).startswith("  in motion: mug-white 0.1 %, not enrolled; view 4")
     assert "mug-white 99.7 %, enough" in line(replace(frame, outcome=Outcome.FOUND))
+
+
+def test_verification_is_put_into_words() -> None:
+    found = Verified(3, "mug", 0.7, 0.4, 0.8, Outcome.FOUND, 0.99, 0.005)
+    words = (
+        "its enrolled views explain 70.0 % of the contrast (of each other 80.0 %), those of the second candidate 40.0 %"
+    )
+    assert words in verification_words(found)
+    assert line(found).endswith("it is mug with 99.0 %, and not enrolled with 0.5 %.")
 
 
 def test_comparison_is_put_into_words() -> None:
@@ -219,12 +222,14 @@ def test_move_is_put_into_words() -> None:
     assert move_words(replace(move, rotation_imu_deg=None)).endswith("no gyro value")
 
 
-def test_probability_of_a_candidate_is_not_given_for_an_unknown_object() -> None:
+def test_not_enrolled_is_one_more_candidate() -> None:
     candidate = Candidate("mug", 0.9, 0.0, 0.9999)
-    decision = StopDecision(Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD, 0, 0.9999, 0.95, 0.9, 1.02)
-    assert share_words(candidate, decision) == ""
-    assert share_words(candidate, replace(decision, outcome=Outcome.FOUND)) == share_words(candidate, None) == ">99.9 %"
-    assert share_words(replace(candidate, probability=None), None) == ""
+    assert share_words(candidate) == ">99.9 %"
+    assert share_words(replace(candidate, probability=None)) == ""
+    decision = StopDecision(Outcome.CONTINUE, StopReason.NOT_CONFIDENT, 0, 0.6, 0.25, 0.98)
+    ranked = Ranked(0, (replace(candidate, probability=0.6), Candidate("cup", 0.8, 0.0, 0.15)), 0.1, decision)
+    assert "mug 0.900 (60.0 %) at 0.0°, cup 0.800 (15.0 %) at 0.0°, not enrolled (25.0 %) (margin" in line(ranked)
+    assert "not enrolled" not in line(replace(ranked, decision=None))
 
 
 @pytest.mark.parametrize(
@@ -238,9 +243,6 @@ def test_probability_of_a_candidate_is_not_given_for_an_unknown_object() -> None
         (NoteCode.EMPTY_TABLE_OF_ENROLLMENT, {"problems": [{"code": "missing"}]}, "enrollment is used (there is no"),
         (NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}, "image: there is no"),
         (NoteCode.TABLE_DIFFERS, {"taken_utc": "2026-01-02"}, "does not look as it did at 2026-01-02"),
-        (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON)"),
-        (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 1, "removed": 2}, "1 object added, 2 obj"),
-        (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 0, "removed": 0}, "(other views, or"),
         (NoteCode.NOT_COMPARED, {"what": "no image"}, "are not compared pixel by pixel: no image"),
     ],
 )
@@ -249,35 +251,9 @@ def test_note_is_put_into_words(code: NoteCode, values: dict[str, object], words
 
 
 def test_warnings_have_a_next_step() -> None:
-    assert note_words(NOTE).startswith(
-        "24 leave-one-out searches cannot guarantee at most 1.0 % wrong answers and 2.0 %"
-    )
+    assert note_words(NOTE).startswith("most objects were enrolled without an empty-table image")
     for code in (NoteCode.EMPTY_TABLE_CHANGED, NoteCode.TABLE_DIFFERS):
         assert note_steps(Note(code))[-1] == Do.EMPTY_TABLE()
     for steps in (("Wait.",), (Do.FREE_DISK(), Do.ENROLL(name="cup"))):
         assert note_steps(Note(NoteCode.NOT_RECORDED, {"steps": steps_as_json(steps)})) == steps
     assert wait_words(WaitReason.NEXT_OBJECT) != wait_words(WaitReason.FIRST_OBJECT)
-
-
-NUMBERS = {"rate": 0.01, "searches": 24, "needed": 100, "min_confidence": 0.98, "wrong": 1, "ended": 20}
-
-
-@pytest.mark.parametrize(
-    ("code", "values", "words"),
-    [
-        (LimitationCode.SAMPLED, {"searched": 20, "objects": 400}, "only 20 of 400 objects were searched for"),
-        (LimitationCode.FALSE_REJECT_RATE, {**NUMBERS, "reached": 0.04}, "1.0 % needs 100 leave-one-out searches, and"),
-        (LimitationCode.ERROR_RATE, NUMBERS, "a confidence of 98 %, at which 1 of 20 were wrong"),
-        (LimitationCode.SIMILAR_OBJECTS, NUMBERS, "because enrolled objects are too similar"),
-        (
-            LimitationCode.FALSE_ACCEPT_RATE,
-            {"rate": 0.02, "accepted": 6, "searches": 120},
-            "left-out objects were (5.0 %)",
-        ),
-        (LimitationCode.UNKNOWN_NOT_MEASURED, {}, "fewer than three objects"),
-        (LimitationCode.ONE_OBJECT, {}, "with one object there is no other candidate"),
-        (LimitationCode.SINGLE_VIEWS, {}, "a single view"),
-    ],
-)
-def test_limitation_is_put_into_words(code: LimitationCode, values: dict[str, object], words: str) -> None:
-    assert words in limitation_words(Limitation(code, values))

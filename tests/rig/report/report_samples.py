@@ -27,11 +27,12 @@ from rig.events.events import (
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.safety.gyro_rotation import Stillness
 from rig.views.capture import ViewEvidence
+from rig.views.description import BENCH_DESCRIPTOR
 
 NAMES = ("mug-white", "mug-star", "teapot", "vase-blue", "lamp")
 
 
-NOTE = Note(NoteCode.RATES_NOT_GUARANTEED, {"searches": 24, "error_rate": 0.01, "false_reject": 0.02})
+NOTE = Note(NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE)
 
 
 def evidence(sharpness: float = 100.0) -> ViewEvidence:
@@ -112,7 +113,7 @@ def searching_densely(
 ) -> Iterator[Event]:
     """Yield a dense search with these rotations, which distinguish the first two of `NAMES` best."""
     rng = np.random.default_rng(6)
-    yield Started("identify", None, 8, {}, strategy="dense", descriptor="edges+colours", notes=(NOTE,))
+    yield Started("identify", None, 8, {}, strategy="dense", descriptor=BENCH_DESCRIPTOR, notes=(NOTE,))
     possible_deg = tuple(float(rotation) for rotation in range(-175, 185, 5) if rotation)
     orientation_deg = 0.0
     for k in range(len(rotations_deg) + 1):
@@ -121,11 +122,11 @@ def searching_densely(
         yield moved(k, -orientation_deg, -rotation_deg)
         yield Accepted(k, float(wrap360(orientation_deg)), evidence(), noise(rng, (48, 64)), {"agreement": 0.9})
         pose_deg = float(wrap360(orientation_deg - 30))
-        probability = (0.6 + 0.2 * k, 0.4 - 0.2 * k, 0.0005, 0.0, 0.0)
+        probability = (0.6 + 0.15 * k, 0.3 - 0.15 * k, 0.0005, 0.0, 0.0)
         candidates = tuple(
             Candidate(n, 0.9 - 0.1 * i, pose_deg, p) for i, (n, p) in enumerate(zip(NAMES, probability, strict=True))
         )
-        decision = StopDecision(Outcome.CONTINUE, StopReason.NOT_CONFIDENT, 0, 0.6, 0.95, 1.02, 0.95)
+        decision = StopDecision(Outcome.CONTINUE, StopReason.NOT_CONFIDENT, 0, probability[0], 0.0995, 0.95)
         yield Ranked(k, candidates, 0.1, decision)
         if k < len(rotations_deg):
             step_deg = rotations_deg[k]
@@ -158,8 +159,7 @@ def searching_densely(
         period_deg=360.0,
         confidence=None if answer is None else probability[0],
         min_confidence=0.95,
-        open_set_score=1.02,
-        open_set_threshold=0.95,
+        not_enrolled=0.0995,
     )
 
 

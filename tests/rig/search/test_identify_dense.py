@@ -12,6 +12,7 @@ from rig.plans.enroll import enroll
 from rig.plans.identify import identify, watch
 from rig.plans.photograph_table import photograph_table
 from rig.search.model import load_model
+from rig.views.description import BENCH_DESCRIPTOR
 from tests.small import SMALL
 
 
@@ -54,8 +55,8 @@ def test_objects_enrolled_without_an_empty_table_image_are_searched_without_one(
     events, answer = search(s, shelf, "dice")
     started = events[0]
     assert isinstance(started, Started)
-    assert codes(started) <= {NoteCode.RATES_NOT_GUARANTEED}
-    assert (started.strategy, started.descriptor, answer.name) == ("dense", "edges+colours", "dice")
+    assert not codes(started)
+    assert (started.strategy, started.descriptor, answer.name) == ("dense", BENCH_DESCRIPTOR, "dice")
     list(photograph_table(s.bench))
     events, answer = search(s, shelf, "dice")
     assert NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE in codes(events[0])
@@ -71,7 +72,7 @@ def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_
             list(enroll(s.bench, catalog, name, views=6))
         model = load_model(catalog)
         events, answer = search(s, model, "lamp")
-        assert codes(events[0]) <= {NoteCode.RATES_NOT_GUARANTEED}
+        assert not codes(events[0])
         assert answer.name == "lamp"
         another = simulated(seed=5)
         events, answer = search(another, model, "teapot")
@@ -128,12 +129,12 @@ def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simula
     for ranked in (e for e in events if isinstance(e, Ranked)):
         probability = [c.probability for c in ranked.candidates]
         assert probability == sorted(probability, reverse=True)
-        assert sum(probability) == pytest.approx(1)
         assert ranked.decision is not None
+        assert sum(probability) + ranked.decision.not_enrolled == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
-    ("name", "reason"), [("bottle-green", RotationReason.SEVERAL_POSES), ("bowl-hoops", RotationReason.NEW_SIDE)]
+    ("name", "reason"), [("bottle-green", RotationReason.SEVERAL_POSES), ("box-tissues", RotationReason.NEW_SIDE)]
 )
 def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(simulated, shelf, name, reason):
     """All strong hypotheses may be poses of one round object while a second object has 41 %."""
@@ -144,8 +145,8 @@ def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(sim
     decided = [event for event in events if isinstance(event, Decided) and not event.candidates]
     assert reason in {event.reason for event in decided}
     for event in decided:
-        leading = ranked[event.index].candidates[0].probability
-        assert leading is not None
+        probability = [one.probability for one in ranked[event.index].candidates]
+        leading = probability[0] / sum(probability)  # among the enrolled objects
         assert (leading >= 0.95) == (event.reason is RotationReason.NEW_SIDE)
 
 

@@ -1,19 +1,19 @@
 """The last step of a search: near twins are found or ambiguous, never confused."""
 
 from argparse import Namespace
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass
+from math import exp
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import hbr
 from benchmarks.twins import kind_of, searches
-from hbr.dense.session import FOUND_FROM_SAME_BENCH
-from hbr.dense.stopping import fitted_before
+from hbr.dense import stopping
+from hbr.dense.local_difference import PixelFit
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import load_config
@@ -56,54 +56,50 @@ def enrolled(catalog_of_twins: Path) -> Iterator[tuple[Bench, Catalog]]:
         yield bench, catalog
 
 
-def doubtful(rule: hbr.StoppingRule, offset: float) -> hbr.StoppingRule:
-    """A rule with which each search is doubtful after its first view; the offset is added to the open-set score."""
-    model = fitted_before("edges+colours", 1)
-    assert model is not None
-    return replace(
-        rule,
-        min_confidence=0.0,
-        usual_scores=rule.usual_scores[:, :1],
-        open_set=replace(
-            model, weights=model.weights, spread=np.full_like(model.spread, 1e9), offset=np.array([offset])
-        ),
-        open_set_thresholds=(1e6,),
-        unknown_thresholds=(1e6,),
-        leave_one_out_thresholds=(1e6,),
-    )
+@dataclass(frozen=True)
+class Fixed:
+    """A model of the evidence with these log-odds that the leader is enrolled, before its fit and with it."""
+
+    before: float
+    after: float
+
+    def log_odds(self, _numbers: object, _views: float, fit: PixelFit | None) -> float:
+        return self.before if fit is None else self.after
 
 
 @pytest.mark.parametrize(
-    ("offset", "outcome", "answered"),
+    ("after", "outcome", "answered"),
     [
-        (2.0, hbr.Outcome.FOUND, hbr.Outcome.FOUND),
-        (-3.0, hbr.Outcome.AMBIGUOUS, hbr.Outcome.AMBIGUOUS),
-        (-6.8, hbr.Outcome.UNKNOWN, hbr.Outcome.AMBIGUOUS),  # it fits one of two near twins up to noise
+        (6.0, hbr.Outcome.FOUND, hbr.Outcome.FOUND),
+        (0.0, hbr.Outcome.AMBIGUOUS, hbr.Outcome.AMBIGUOUS),
+        (-4.0, hbr.Outcome.UNKNOWN, hbr.Outcome.UNKNOWN),
     ],
 )
 def test_a_doubtful_leader_is_verified_and_the_run_replays(
     enrolled: tuple[Bench, Catalog],
     tmp_path: Path,
-    offset: float,
+    monkeypatch: pytest.MonkeyPatch,
+    after: float,
     outcome: hbr.Outcome,
     answered: hbr.Outcome,
 ) -> None:
     bench, catalog = enrolled
     model = load_model(catalog)
-    assert model.rule is not None
-    model = replace(model, rule=doubtful(model.rule, offset))
+    monkeypatch.setattr(stopping, "_models", lambda: defaultdict(lambda: Fixed(-1.0, after)))
+    for least in ("MIN_CONFIDENCE", "LAST_CONFIDENCE"):
+        monkeypatch.setattr(stopping, least, 0.45)  # twins share the probability
     with RunWriter(tmp_path / "run", bench, model) as writer:
         events = list(identify(bench, model))
         for event in events:
             writer.add(event)
-    (found,) = (event for event in events if isinstance(event, Verified))
+    *_, found = (event for event in events if isinstance(event, Verified))
     answer = events[-1]
     assert isinstance(answer, Identified)
     assert (found.name, found.outcome) == ("vase-blue", outcome)
-    assert found.found_from == FOUND_FROM_SAME_BENCH  # the bench is that of the enrollment
+    assert found.not_enrolled == answer.not_enrolled == pytest.approx(1 / (1 + exp(after)))
+    assert sum(one.probability or 0.0 for one in answer.candidates) == pytest.approx(1 - found.not_enrolled)
     assert answer.outcome is answered
-    assert len(answer.possible) == (2 if answered is hbr.Outcome.AMBIGUOUS else 1)
-    assert (answer.reason is hbr.StopReason.PIXEL_FIT) == (outcome is answered)
+    assert len(answer.possible) == {hbr.Outcome.FOUND: 1, hbr.Outcome.AMBIGUOUS: 2, hbr.Outcome.UNKNOWN: 0}[answered]
     assert 0.5 < found.fit <= 1
     again = check(load_run(tmp_path / "run"))
     assert again.is_complete
@@ -120,14 +116,14 @@ def test_a_missing_image_leaves_the_answer_as_it_is(enrolled: tuple[Bench, Catal
     images = [catalog.image_path(view.image) for view in catalog.object("vase-blue").views]
     hidden = [image.rename(image.with_suffix(".away")) for image in images]
     try:
-        *_, warned, answer = identify(bench, model)
+        events = list(identify(bench, model))
     finally:
         for image in hidden:
             image.rename(image.with_suffix(".png"))
-    assert isinstance(warned, Warned)
+    (warned,) = (event for event in events if isinstance(event, Warned))  # not after each view
     assert warned.note.code is NoteCode.NOT_COMPARED
-    assert isinstance(answer, Identified)
-    assert answer.outcome is not hbr.Outcome.FOUND
+    assert isinstance(events[-1], Identified)
+    assert events[-1].outcome is not hbr.Outcome.FOUND
 
 
 @pytest.mark.nightly

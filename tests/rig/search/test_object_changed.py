@@ -40,7 +40,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Model]:
         yield load_model(catalog)
 
 
-def opened(*faults: str, name: str = "mug-white", yaw_deg: float = 180.0) -> Bench:
+def opened(*faults: str, name: str = "mug-white", yaw_deg: float = 135.0) -> Bench:
     world = World(seed=2)
     operator = ShelfOperator(world, shelf(), next_object=name, yaw_deg=yaw_deg)
     return open_sim_bench(camera_time(world, *SMALL), operator, faults=[Fault.parse(one) for one in faults])

@@ -11,7 +11,7 @@ from hbr.core.angles import wrap180
 from hbr.paper.hmm import CONFIDENT, PoseModel, update_poses
 from rig.config import IdentifyConfig, RigConfig, TableConfig
 from rig.core.errors import CatalogError, UsageError
-from rig.events.events import RotationReason
+from rig.events.events import Ranked, RotationReason
 from rig.search.model import begin_search, model_of
 from rig.search.session import Search
 from rig.search.strategies import Finish, Rotate, Strategy, strategy
@@ -36,6 +36,13 @@ def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, top: i
     return begin_search(model_of(known), settings, chosen, seed=seed, top=top)
 
 
+def added(
+    search: Search, levels: np.ndarray, azimuth_deg: float, *, table_deg: float
+) -> tuple[Ranked, Rotate | Finish]:
+    search.add(seen(levels), azimuth_deg, table_deg=table_deg)
+    return search.decide()
+
+
 def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list[Rotate], Finish, list[float]]:
     """Search with random queries; return the rotations, the end, and the orientations of the views."""
     search = searching(model(), chosen, seed=seed, **config)
@@ -44,7 +51,7 @@ def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list
     while True:
         taken_deg.append(here_deg)
         levels = rng.integers(0, 8, 144, np.uint8)
-        _, step = search.add(seen(levels), here_deg % 360, table_deg=-here_deg)
+        _, step = added(search, levels, here_deg % 360, table_deg=-here_deg)
         if isinstance(step, Finish):
             return rotations, step, taken_deg
         rotations.append(step)
@@ -81,7 +88,7 @@ def test_large_margin_ends_all_but_the_passive_search(name, views):
     known = model()
     search = searching(known, name, max_views=5)
     for number in range(views):
-        ranked, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+        ranked, step = added(search, known.descriptors[0], 0.0, table_deg=0.0)
         assert isinstance(step, Finish) == (number == views - 1)
     assert ranked.candidates[0].name == "o0"
 
@@ -90,7 +97,7 @@ def test_score_below_min_score_ends_no_search_early():
     known = model()
     search = searching(known, "sweep", max_views=5, min_score=1.0, margin=0.0)
     other = np.roll(known.descriptors[0], 1)
-    steps = [search.add(seen(other), 0.0, table_deg=0.0)[1] for _ in range(5)]
+    steps = [added(search, other, 0.0, table_deg=0.0)[1] for _ in range(5)]
     assert [isinstance(step, Finish) for step in steps] == [False] * 4 + [True]
 
 
@@ -98,7 +105,7 @@ def test_top_limits_the_named_candidates():
     known = model(objects=9)
     for top in (1, 3, 9):
         search = searching(known, "ahbr", list_length=200, top=top)
-        ranked, _ = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+        ranked, _ = added(search, known.descriptors[0], 0.0, table_deg=0.0)
         assert len(ranked.candidates) == top
 
 
@@ -108,7 +115,7 @@ def test_the_tree_gives_the_same_answers():
         found = []
         for index in ("flat", "tree"):
             search = searching(known, "ahbr", index=index)
-            found.append(search.add(seen(row), 0.0, table_deg=0.0)[0])
+            found.append(added(search, row, 0.0, table_deg=0.0)[0])
             assert search._index.method == index
         assert found[0] == found[1]
 
@@ -124,7 +131,7 @@ def test_empty_catalog_and_an_unknown_strategy_are_rejected():
 def test_hmm_ends_when_one_object_is_probable_enough():
     known = model()
     search = searching(known, "hmm", max_views=5)
-    ranked, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+    ranked, step = added(search, known.descriptors[0], 0.0, table_deg=0.0)
     assert step == Finish(StopReason.CONFIDENT)
     answer = search.answer()
     assert (answer.name, answer.outcome, answer.possible) == ("o0", hbr.Outcome.FOUND, ("o0",))
@@ -144,7 +151,7 @@ def test_hmm_between_twins_takes_the_view_of_least_risk_and_ends_ambiguous():
     belief = PoseModel(known)
     for place in range(3):
         levels, azimuth_deg = known.descriptors[3 * place], 90.0 * place
-        _, step = search.add(seen(levels), azimuth_deg, table_deg=-azimuth_deg)
+        _, step = added(search, levels, azimuth_deg, table_deg=-azimuth_deg)
         belief = update_poses(hbr.tanimoto(levels[None], known.descriptors)[0], azimuth_deg, belief)
         if place < 2:
             assert step == Rotate(belief.next_view().rotation_deg, RotationReason.LEAST_RISK)
@@ -158,7 +165,7 @@ def test_hmm_calls_an_object_unknown_by_the_threshold_of_the_paper():
     known = model()
     search = searching(known, "hmm", max_views=3, min_score=0.9)
     other = np.random.default_rng(9).integers(0, 8, 144, np.uint8)
-    steps = [search.add(seen(other), 40.0 * n, table_deg=-40.0 * n)[1] for n in range(3)]
+    steps = [added(search, other, 40.0 * n, table_deg=-40.0 * n)[1] for n in range(3)]
     assert steps[-1] == Finish(StopReason.MAX_VIEWS)
     assert all(isinstance(step, Rotate) for step in steps[:-1])  # a low score ends no search early
     similar = hbr.tanimoto(other[None], known.descriptors)[0]
@@ -174,10 +181,10 @@ def test_hmm_rotates_only_as_far_as_the_cable_allows():
     twin = hbr.Views.of_object("twin", known.descriptors, known.azimuth_deg)
     config = RigConfig(table=TableConfig(mode="pan", limits_deg=(-10.0, 60.0)))
     search = begin_search(model_of(hbr.Views.concatenate([known, twin])), config, "hmm")
-    _, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+    _, step = added(search, known.descriptors[0], 0.0, table_deg=0.0)
     target_deg = config.table.orientation_sign * step.rotation_deg
     assert -10 <= target_deg <= 60
     narrow = RigConfig(table=TableConfig(mode="pan", limits_deg=(-1.0, 1.0)))
     search = begin_search(model_of(hbr.Views.concatenate([known, twin])), narrow, "hmm")
-    _, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+    _, step = added(search, known.descriptors[0], 0.0, table_deg=0.0)
     assert step == Finish(StopReason.NO_ROTATION_LEFT)

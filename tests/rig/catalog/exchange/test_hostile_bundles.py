@@ -19,6 +19,7 @@ from rig.catalog.images import name_of, path_of
 from rig.catalog.transfer import CatalogSource
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected
+from rig.views.description import DESCRIPTORS
 from rig.views.image_files import encode
 from sim.clock import VirtualClock
 from tests.fuzzing import examples
@@ -151,7 +152,7 @@ class TestHostileBundles:
     def test_what_is_computed_is_not_taken_from_a_bundle(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         forged = "INSERT INTO derived VALUES ((SELECT seal FROM log WHERE seal IS NOT NULL), '{}', 'x', x'00', 'x')"
         catalog = open_catalog("catalog")
-        import_bundle(catalog, rewritten(bundle, *(forged.format(name) for name in ("cedd", "edges+colours"))))
+        import_bundle(catalog, rewritten(bundle, *(forged.format(name) for name in DESCRIPTORS)))
         assert np.array_equal(views(catalog).descriptors[0], hbr.describe(image(0)))
         assert finished(verify(catalog, jobs=1)).findings == ()
 

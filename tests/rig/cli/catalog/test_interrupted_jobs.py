@@ -1,7 +1,6 @@
 """Long jobs of the catalog continue after Ctrl+C."""
 
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -45,11 +44,3 @@ def test_interrupted_redescription_continues(two: Rig, monkeypatch: pytest.Monke
     assert stopped.exit_code == 130
     assert "To continue: rig catalog redescribe --descriptor cedd" in stopped.stderr
     assert "4 views described, 4 unchanged" in two("catalog", "redescribe").stdout
-
-
-def test_interrupted_fit_changes_nothing(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    interrupt(monkeypatch, "rig.core.processes", 1)
-    stopped = two("catalog", "fit")
-    assert stopped.exit_code == 130
-    assert "Interrupted; nothing changed." in stopped.stderr
-    assert not Path("catalog/search_rules.json").exists()
