@@ -72,7 +72,12 @@ class Belief:
         return DenseRanking(self.index.object_index[order], scores[order])
 
     @cached_property
-    def _posterior(self) -> FloatArray:
+    def posterior(self) -> FloatArray:
+        """The probability of every hypothesis among the enrolled objects, (k, 72), read-only.
+
+        It is proportional to exp(β A / √n). The root is there because views of one object are not independent: each
+        adds less than the one before. Weights contain that already; with weights there is no root.
+        """
         root = np.sqrt(self.queries) if self.weights is None else 1.0
         probability: FloatArray = self.support.astype(np.float64)
         probability *= BETA / root
@@ -82,17 +87,9 @@ class Belief:
         probability.flags.writeable = False
         return probability
 
-    def posterior(self) -> FloatArray:
-        """Return the probability of every hypothesis among the enrolled objects, (k, 72), read-only.
-
-        It is proportional to exp(β A / √n). The root is there because views of one object are not independent: each
-        adds less than the one before. Weights contain that already; with weights there is no root.
-        """
-        return self._posterior
-
     def probability(self) -> FloatArray:
         """Return the probability of every object considered among them, (k,): the sum over its azimuths."""
-        probability: FloatArray = self.posterior().sum(axis=1)
+        probability: FloatArray = self.posterior.sum(axis=1)
         return probability
 
     def likeliest(self) -> tuple[int, float]:

@@ -152,11 +152,6 @@ class LocalDecision:
     apart: float
     views: tuple[ViewDifference, ...]
 
-    @property
-    def fits(self) -> bool:
-        """Whether the better object explains the views up to noise."""
-        return self.misfit <= MAX_MISFIT
-
 
 class _Fit(NamedTuple):
     """An enrolled view that was registered to another one, its difference from that one, and the mean of that."""

@@ -151,7 +151,7 @@ class Pairs(NamedTuple):
 
 def pairs_after(belief: Belief, rotations_deg: FloatArray) -> Pairs:
     """Return the pairs of strong hypotheses, after each of some rotations, float64 (a,)."""
-    probability, place, bin_of = strongest(belief.posterior())
+    probability, place, bin_of = strongest(belief.posterior)
     first, second = _all_pairs(len(place))
     different = place[first] != place[second]
     first, second = first[different], second[different]

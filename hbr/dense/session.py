@@ -41,14 +41,12 @@ from hbr.dense.local_difference import (
 )
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.pose import poses_of
-from hbr.dense.stopping import ERROR_RATE, Outcome, StopDecision, StopReason, decide, posterior
+from hbr.dense.stopping import ERROR_RATE, HOPELESS, Outcome, StopDecision, StopReason, decide
 
 #: Segmentations of each view that are compared.
 _SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of both candidates
-#: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search;
-#: and after the last view, no fit changes the answer.
+#: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search.
 _NOT_WORTH_A_FIT: Final = 0.95
-_HOPELESS: Final = 0.998
 #: Share of the probability that the two leaders have together.
 LEADERS: Final = 0.9  # with less, a third object is likely, and a difference of two decides nothing
 
@@ -104,13 +102,27 @@ class Verification(NamedTuple):
 
 
 class _Fits:
-    """The fits of a search; each is measured once."""
+    """The fits of a search, and the enrolled views that they need; each is measured, and asked for, once."""
 
     def __init__(self) -> None:
+        self._views: dict[int, dict[float, LocalView]] = {}
         self._seen: dict[int, list[Pixels]] = {}
         self._enrolled: dict[tuple[int, float], Pixels] = {}
         self._of_views: dict[tuple[int, int, float], float] = {}
         self._of_pairs: dict[tuple[int, float, float], float] = {}
+
+    def views(
+        self, object_index: int, own_deg: FloatArray, azimuths_deg: Sequence[float]
+    ) -> Asking[Sequence[LocalView] | None]:
+        """Return enrolled views of an object, those next to some azimuths among them; ``own_deg`` has those of all."""
+        known = self._views.setdefault(object_index, {})
+        unknown = [deg for deg in azimuths_deg if not known.keys() >= set(own_deg[_nearest(own_deg, deg)].tolist())]
+        if unknown:
+            found = yield NeedEnrolledViews(object_index, tuple(unknown))
+            if not found:
+                return None
+            known.update((view.azimuth_deg, view) for view in found)
+        return list(known.values())
 
     def of_view(self, n: int, queries: Queries, object_index: int, enrolled: LocalView) -> float:
         """Return the fit of an enrolled view to the view n of the search, by its better segmentation."""
@@ -148,8 +160,9 @@ def verify(belief: Belief, queries: Queries, fits: _Fits | None = None) -> Askin
     for candidate in belief.index.object_index[order].tolist():
         pose_deg, *_ = poses_of(belief, candidate)
         azimuths_deg = [wrap360(pose_deg + o - last_deg) for o in belief.orientation_deg.tolist()]
-        views = yield NeedEnrolledViews(candidate, tuple(azimuths_deg))
-        if not views:
+        own_deg = belief.index.views.azimuth_deg[belief.index.views.of(candidate)]
+        views = yield from fits.views(candidate, own_deg, azimuths_deg)
+        if views is None:
             return None
         enrolled_deg = np.array([view.azimuth_deg for view in views])
         nearest = [[views[place] for place in _nearest(enrolled_deg, deg).tolist()] for deg in azimuths_deg]
@@ -366,10 +379,13 @@ class DenseSession:
 
     def _forget(self) -> None:
         """Forget all views."""
+        self._forget_queries()
+        self._disturbed.clear()
+
+    def _forget_queries(self) -> None:
         self._so_far, self._index, self._closest = self._all, self._all, None
         self._queries, self._fits = [], _Fits()
         self._before.clear()
-        self._disturbed.clear()
 
     def _begin_view(self, orientation_deg: float) -> None:
         """Set ``is_new_decision`` for the next view."""
@@ -419,9 +435,7 @@ class DenseSession:
         if all(np.array_equal(a, b) for a, b in zip(queries, self._queries, strict=True)):
             return
         orientations_deg = self.belief.orientation_deg.tolist()
-        disturbed = set(self._disturbed)
-        self._forget()
-        self._disturbed |= disturbed
+        self._forget_queries()
         for query, orientation_deg in zip(queries, orientations_deg, strict=True):
             self._extend(query, orientation_deg)
 
@@ -451,14 +465,9 @@ class DenseSession:
             self.decision = self.present = self._decide()
         return measured
 
-    def posterior(self) -> tuple[FloatArray, float]:
-        """Return the probability of each object considered, and that the object is not enrolled."""
-        fit = None if self.verification is None else self.verification.fit
-        return posterior(self.belief, fit, other_bench=self._other_bench)
-
     def _is_worth_a_fit(self) -> bool:
         last = self.belief.queries >= self.max_views
-        return (last or self._reliable) and self.decision.not_enrolled < (_HOPELESS if last else _NOT_WORTH_A_FIT)
+        return (last or self._reliable) and self.decision.not_enrolled < (HOPELESS if last else _NOT_WORTH_A_FIT)
 
     def compare(self, queries: Queries) -> Asking[LeaderComparison | None]:
         """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None."""

@@ -161,8 +161,7 @@ def parts_of(kind: Descriptor) -> list[tuple[Descriptor, slice]]:
     """Return the parts of a descriptor, and the columns of each in its levels."""
     if not isinstance(kind, Joined):
         return [(kind, slice(0, kind.length))]
-    ends = np.cumsum([part.length for part in kind.parts]).tolist()
-    return [(part, slice(end - part.length, end)) for part, end in zip(kind.parts, ends, strict=True)]
+    return list(zip(kind.parts, kind.columns(), strict=True))
 
 
 def uses_of(kind: Descriptor) -> tuple[_Use, ...]:

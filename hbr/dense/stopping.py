@@ -1,12 +1,13 @@
 """The posterior of a search over the enrolled objects and "not enrolled", and the decision that follows from it.
 
 The numbers of `hbr.dense.evidence` give the log-odds that the leading candidate is the object on the table, by a
-logistic model for each number of views. The pixel by pixel fit of a doubtful leader is one more number. What is left is
-the probability that the object is not enrolled. `Belief` divides the rest among the enrolled objects.
+logistic model for each number of views. The pixel by pixel fit of the leader is one more number. What is left is the
+probability that the object is not enrolled. `Belief` divides the rest among the enrolled objects.
 
-The weights (``evidence.json``) are the same for all catalogs. `python -m benchmarks.fit_search` fits them to objects
-1-50 of COIL-100, on drawn benches and in the photographs as they are, with and without noise, with 3 to 100 enrolled
-objects, and with half of the searches for objects that are not enrolled. Measured rates: docs/results.md.
+The weights (``evidence.json``) are the same for all catalogs. They were fitted to objects 1-50 of COIL-100, after hard
+changes of a drawn bench and in the photographs as they are, with and without Gaussian noise, and with half of the
+searches for objects that are not enrolled. `python -m benchmarks.fit_search` does such a fit. Measured rates:
+docs/results.md.
 
 Decision: docs/decisions/0015.
 """
@@ -33,7 +34,7 @@ WEIGHTS: Final = "evidence.json"
 MIN_CONFIDENCE: Final = 0.97
 LAST_CONFIDENCE: Final = 0.9
 #: Probability of "not enrolled" that ends a search before its last view: no pixel by pixel fit would change it.
-_HOPELESS: Final = 0.998
+HOPELESS: Final = 0.998
 #: After the last view, an object is unknown from this probability on, and otherwise ambiguous.
 UNKNOWN_FROM: Final = 0.8
 #: Added to the log-odds on another bench than that of the enrollment. Another bench makes an enrolled object less
@@ -129,7 +130,7 @@ def decide(
     least = LAST_CONFIDENCE if last else MIN_CONFIDENCE
     if best >= least:
         outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
-    elif not_enrolled >= (UNKNOWN_FROM if last else _HOPELESS):
+    elif not_enrolled >= (UNKNOWN_FROM if last else HOPELESS):
         outcome, reason = Outcome.UNKNOWN, StopReason.NOT_ENROLLED
     elif last:
         outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS

@@ -42,28 +42,28 @@ class Joined(Descriptor):
 
     def prepared(self, rows: LevelArray, /) -> "_Average":
         self.check_rows(rows)
-        columns = self._columns()
+        columns = self.columns()
         parts = [part.prepared(rows[:, own]) for part, own in zip(self.parts, columns, strict=True)]
         return _Average(parts, self.weights, columns)
 
     def opened(self, packed: LevelArray, /) -> "_Average":
         self.check_packed(packed)
         columns = zip(self.parts, self._packed_columns(), strict=True)
-        return _Average([part.opened(packed[:, own]) for part, own in columns], self.weights, self._columns())
+        return _Average([part.opened(packed[:, own]) for part, own in columns], self.weights, self.columns())
 
     def entries(self, rows: LevelArray) -> FloatArray:
         return np.concatenate(
-            [part.entries(rows[:, own]) for part, own in zip(self.parts, self._columns(), strict=True)], axis=1
+            [part.entries(rows[:, own]) for part, own in zip(self.parts, self.columns(), strict=True)], axis=1
         )
 
     def similarity_of_means(self, means: FloatArray) -> FloatArray:
         similar = [
-            part.similarity_of_means(means[:, own]) for part, own in zip(self.parts, self._columns(), strict=True)
+            part.similarity_of_means(means[:, own]) for part, own in zip(self.parts, self.columns(), strict=True)
         ]
         return _weighted(self.weights, similar)
 
     def pack_rows(self, rows: LevelArray) -> LevelArray:
-        columns = zip(self.parts, self._columns(), strict=True)
+        columns = zip(self.parts, self.columns(), strict=True)
         return np.concatenate([part.pack_rows(rows[:, own]) for part, own in columns], axis=1)
 
     def unpack_rows(self, packed: bytes) -> LevelArray:
@@ -72,10 +72,11 @@ class Joined(Descriptor):
         return np.concatenate([part.unpack_rows(rows[:, own].tobytes()) for part, own in columns], axis=1)
 
     def check_levels(self, rows: LevelArray) -> None:
-        for part, columns in zip(self.parts, self._columns(), strict=True):
+        for part, columns in zip(self.parts, self.columns(), strict=True):
             part.check_levels(rows[:, columns])
 
-    def _columns(self) -> list[slice]:
+    def columns(self) -> list[slice]:
+        """Return the columns of each part in the levels."""
         return _slices([part.length for part in self.parts])
 
     def _packed_columns(self) -> list[slice]:

@@ -27,7 +27,7 @@ from hbr.evaluation.condition import Condition
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset, PhotographedObject, object_mask, read_photograph, without_specks
 from hbr.evaluation.poses import StatedPose, pose_rates, stated_pose
-from hbr.evaluation.protocol import generator, views_enrolled
+from hbr.evaluation.protocol import generator, index_of, views_enrolled
 from hbr.evaluation.statistics import bootstrap_mean
 from hbr.model.views import Views
 from hbr.segmentation import Background
@@ -463,17 +463,11 @@ def _model(
     return Views.concatenate(parts)
 
 
-@lru_cache(maxsize=1)
-def _index(views: Views) -> DenseIndex:
-    """Return the index of all objects, which each process makes once."""
-    return DenseIndex(views)
-
-
 def _search(
     experiment: Experiment, dataset: Dataset, model: Views, _now_ns: Callable[[], int], j: int
 ) -> list[SearchResult]:
     enrolled = partial(_enrolled, experiment, dataset)
-    return search_changed(dataset.objects[j], experiment, _index(model), enrolled)
+    return search_changed(dataset.objects[j], experiment, index_of(model), enrolled)
 
 
 def _results(experiment: Experiment, dataset: Dataset, views: Views, found: list[list[SearchResult]]) -> dict[str, Any]:

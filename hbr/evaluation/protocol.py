@@ -3,6 +3,7 @@
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray
-from hbr.dense.index import OMEGA
+from hbr.dense.index import OMEGA, DenseIndex
 from hbr.dense.stopping import Outcome
 from hbr.model.views import Views
 from hbr.paper.hough import Extension
@@ -291,6 +292,12 @@ class Runs:
     def concatenate(cls, parts: Sequence["Runs"]) -> "Runs":
         """Return the runs of the objects of all parts, in their order."""
         return cls(*(np.concatenate([getattr(part, item.name) for part in parts], axis=1) for item in fields(cls)))
+
+
+@lru_cache(maxsize=1)
+def index_of(views: Views) -> DenseIndex:
+    """Return the index of all objects, which each process makes once."""
+    return DenseIndex(views)
 
 
 def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:

@@ -8,7 +8,6 @@ whether the object changed (`hbr.dense.change`).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from hbr.dense.stopping import Outcome
 from hbr.evaluation.condition import enrolled_levels, query_levels
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset
-from hbr.evaluation.protocol import generator, views_of_trial
+from hbr.evaluation.protocol import generator, index_of, views_of_trial
 from hbr.evaluation.statistics import wilson
 from hbr.evaluation.trials import all_views
 from hbr.model.views import Views
@@ -118,16 +117,10 @@ def _model(experiment: Experiment, dataset: Dataset, described: list[_Described]
     return _Model(views.select(is_enrolled), tuple(queries))
 
 
-@lru_cache(maxsize=1)
-def _index(views: Views) -> DenseIndex:
-    """Return the index of all objects, which each process makes once."""
-    return DenseIndex(views)
-
-
 def _search(
     experiment: Experiment, dataset: Dataset, model: _Model, _now_ns: Callable[[], int], j: int
 ) -> list[ReplacedSearch]:
-    enrolled, others = _index(model.enrolled), [k for k in range(len(dataset.objects)) if k != j]
+    enrolled, others = index_of(model.enrolled), [k for k in range(len(dataset.objects)) if k != j]
     results = []
     for trial in range(experiment.protocol.trials):
         for way in _WAYS[: 1 if trial % _MOTION_EVERY else 2]:

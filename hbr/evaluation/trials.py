@@ -485,7 +485,7 @@ def most_informative_rotation(belief: Belief) -> float:
     If hypothesis h is true, the view after a rotation is the one that was enrolled there. The likelihood of hypothesis
     h' is then exp(β z(view_h, view_h') / √n).
     """
-    probability, place, bin_of = strongest(belief.posterior())
+    probability, place, bin_of = strongest(belief.posterior)
     rows, _ = expected_views(belief, place, bin_of, ALL_ROTATIONS_DEG)
     # z relative to that of equal views
     z = belief.index.space.largest.sum() * (belief.index.among(rows) - 1)

@@ -565,6 +565,8 @@ def _smooth(corners: list[tuple[slice, slice]], away: cv2.typing.MatLike, noise:
 class SegmentedFrame:
     """A frame, uint8 (H, W, 3), and its small image; ``described`` has its levels by descriptors of the whole frame.
 
+    ``alone`` has what the network finds in this frame alone, once it has looked.
+
     Raises `TypeError`, `ValueError`: the array is no such image.
     """
 
@@ -573,6 +575,7 @@ class SegmentedFrame:
         self.image = image_bgr
         self.small = shrunk(image_bgr)
         self.described: dict[str, LevelArray] = {}
+        self.alone: Floats | None = None
         self._compared: tuple[Background, Difference] | None = None
 
     @classmethod

@@ -264,10 +264,10 @@ def _with_still_parts(found: Found, like: Found, platter: Floats) -> Found | Non
     added = whole & ~found.silhouette
     if np.count_nonzero(added) < (_MORE - 1) * np.count_nonzero(found.silhouette):
         return None
-    frame = found.frame
-    if _mean(shares(frame.small, textured=frame.textured).object, added) < _STILL_FROM:
+    if _mean(_share_alone(found.frame), added) < _STILL_FROM:
         return None
-    return replace(found, silhouette=silhouette(whole, framed=False))
+    mask = silhouette(whole, framed=False)
+    return None if mask is None else replace(found, silhouette=mask)
 
 
 def _mean(values: Floats | Mask, mask: Mask) -> float:
@@ -294,8 +294,14 @@ def without_background(frame: SegmentedFrame) -> tuple[Found, ...]:
 
 def _alone(frame: SegmentedFrame, like: Found) -> list[Found]:
     """Return the network's silhouette of a frame whose background is not known."""
-    share = shares(frame.small, textured=frame.textured).object
-    return _by_network(share, BoxMethod.NETWORK, like, _levels(frame)[:1])
+    return _by_network(_share_alone(frame), BoxMethod.NETWORK, like, _levels(frame)[:1])
+
+
+def _share_alone(frame: SegmentedFrame) -> Floats:
+    """Return the probability of the object in a frame whose background is not known; the network looks once."""
+    if frame.alone is None:
+        frame.alone = shares(frame.small, textured=frame.textured).object
+    return frame.alone
 
 
 def _levels(frame: SegmentedFrame) -> tuple[float, ...]:

@@ -479,7 +479,7 @@ class DenseSearch(Search):
 
     def _probability(self) -> NDArray[np.float64]:
         """Return the probability of each object considered; what is missing to 1 is that of "not enrolled"."""
-        return self._session.posterior()[0]
+        return self._session.belief.probability() * (1 - self._session.decision.not_enrolled)
 
     def changed(self) -> ObjectChanged | None:
         change = self._session.change

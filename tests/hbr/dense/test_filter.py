@@ -78,7 +78,7 @@ def test_support_follows_the_formula_at_every_azimuth_of_every_object(
     mean = np.maximum(index.space.similarity(wanted.max(axis=1) / len(angles)), 0)
     np.testing.assert_allclose(np.sort(ranking.scores), np.sort(mean), atol=1e-4)
     posterior = np.exp(BETA * (wanted - wanted.max()) / np.sqrt(len(angles)))
-    np.testing.assert_allclose(belief.posterior(), posterior / posterior.sum(), atol=1e-3)
+    np.testing.assert_allclose(belief.posterior, posterior / posterior.sum(), atol=1e-3)
     assert belief.likeliest() == (int(belief.probability().argmax()), belief.probability().max())
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import hbr
 from hbr.dense.local_difference import (
+    MAX_MISFIT,
     MOST_VIEWS,
     LocalView,
     chosen_views,
@@ -51,7 +52,7 @@ def test_views_of_a_twin_are_recognised_by_its_sticker(objects, sticker: bool) -
     assert found.winner == int(sticker)
     assert found.score * (-1 if sticker else 1) > 0.6
     assert found.error_bound <= 0.01
-    assert found.fits
+    assert found.misfit <= MAX_MISFIT
     y, x = np.unravel_index(int(found.views[0].difference.argmax()), found.views[0].difference.shape)
     away = (abs(x / 0.8 - 82.5), abs(y / 0.8 - 78.5))  # from the middle; the sticker is 14 px wide and 14 degrees aside
     assert away[0] < 30
@@ -68,7 +69,7 @@ def test_comparison_names_no_winner_if_it_is_unclear_or_its_error_rate_is_too_hi
     plain, marked = (shown(14.0, sticker=kind, noise=90) for kind in (False, True))
     pale = replace(plain, crop=cv2.addWeighted(plain.crop, 0.5, marked.crop, 0.5, 0))
     between = compare_objects([pale], objects, ([0.0], [0.0]))
-    assert between.fits
+    assert between.misfit <= MAX_MISFIT
     assert between.error_bound <= 0.01
     assert abs(between.score) < 0.3
     assert between.winner is None
@@ -81,7 +82,7 @@ def test_comparison_decides_nothing_if_twins_look_the_same(objects) -> None:
     found = compare_objects([shown(4.0, sticker=False, noise=91)], (plain, plain[::-1]), ([0.0], [0.0]))
     assert found.winner is None
     assert found.expected is None
-    assert found.fits
+    assert found.misfit <= MAX_MISFIT
 
 
 def test_another_object_fits_neither_twin(objects) -> None:
@@ -89,7 +90,7 @@ def test_another_object_fits_neither_twin(objects) -> None:
     other = LocalView(np.ascontiguousarray(query.crop[::-1]), query.mask, query.azimuth_deg)
     found = compare_objects([other], objects, ([0.0], [0.0]))
     assert found.winner is None
-    assert not found.fits
+    assert found.misfit > MAX_MISFIT
 
 
 def test_small_displacements_are_no_difference_but_missing_details_are() -> None:

@@ -81,7 +81,7 @@ def test_expected_confusion_equals_the_formula(start: int) -> None:
     belief = update_belief(viewed(start * STEP), 20.0, INDEX)
     revolutions = np.array([-120.0, 33.0, 90.0])
     see = next_best_view(belief, rotations_deg=revolutions)
-    probability, place, bins = strongest(belief.posterior())
+    probability, place, bins = strongest(belief.posterior)
     for rotation, confusion in zip(revolutions, see.confusion, strict=True):
         novelty = 1 - np.exp(-0.5 * (min(abs(rotation), 360 - abs(rotation)) / 15) ** 2)
         away = [

@@ -108,4 +108,4 @@ def test_the_next_view_is_that_of_the_belief(index: DenseIndex) -> None:
     chosen = session.next_best_view([-90.0, 45.0, 120.0], [1.0, 0.5, 1.3])
     assert chosen.rotation_deg in (-90.0, 45.0, 120.0)
     belief = update_belief(view(index.views, 3, 0.0), 0.0, index)
-    np.testing.assert_array_equal(session.belief.posterior(), belief.posterior())
+    np.testing.assert_array_equal(session.belief.posterior, belief.posterior)

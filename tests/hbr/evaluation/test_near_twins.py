@@ -53,7 +53,7 @@ def test_searches_for_near_twins_compare_the_two_leaders(folder: Path, monkeypat
     assert not LocalPhotographs(dataset, Condition(), 0).possible  # plain CEDD cuts nothing out
     queries = query_levels(dataset, 1, condition, protocol.seed)
     # no search is confident, and no object is unknown: each ends as ambiguous
-    for name in ("MIN_CONFIDENCE", "LAST_CONFIDENCE", "UNKNOWN_FROM", "_HOPELESS"):
+    for name in ("MIN_CONFIDENCE", "LAST_CONFIDENCE", "UNKNOWN_FROM", "HOPELESS"):
         monkeypatch.setattr(f"hbr.dense.stopping.{name}", 2.0)
     without, with_images = (
         run_object(1, queries, views, [METHODS["dense-90"]], protocol, photographs=images)

@@ -118,7 +118,7 @@ def test_search_by_an_orbiting_camera_goes_where_an_image_was_taken(
         list(photograph_table(s.bench, views=12))
         for name in ("mug-star", "mug-white"):
             list(enroll(s.bench, catalog, name, views=12))
-        for limit in ("MIN_CONFIDENCE", "_HOPELESS"):
+        for limit in ("MIN_CONFIDENCE", "HOPELESS"):
             monkeypatch.setattr(stopping, limit, 2.0)  # so that the search takes all its views
         s.operator.next_object, s.operator.yaw_deg = "mug-white", 100.0
         views = [e for e in identify(s.bench, load_model(catalog)) if isinstance(e, Accepted)]
