@@ -1,29 +1,161 @@
-"""The Dynamixel models that the SDK knows, and which of them the driver fits.
+"""The table of Dynamixel models: registers, resolution and units of each, for driver, doctor and simulator.
 
-The driver is written for the XL430-W250. It fits the models whose `.model` file has the same counts per revolution,
-unit of speed, and registers.
+Registers, counts per revolution and the unit of speed come from the `.model` file in the SDK; `_SERIES` adds what the
+files lack. A model is driven only if its row has everything that the driver uses.
 """
 
 import difflib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from importlib.resources import files
 from math import pi
+from typing import Any, Final
 
-REFERENCE = "xl430_w250"
-OWN = "ax_12a"
-"""The model that the rig knows without the SDK, which has no file for it."""
 GROUP = "rig.servos"
-"""Entry-point group in which packages name a `rig.devices.dynamixel.registers.DynamixelModel`, or a
-`rig.devices.servo.ServoDriver`."""
-USE_ANOTHER = "Use a servo of the X series or the MX series (2.0), or an AX-12A"
+"""Entry-point group in which packages name a `DynamixelModel`, or a `rig.devices.servo.ServoDriver`."""
+USE_ANOTHER = "Use a servo of the X series, the MX series (2.0), the P series or the PRO series (A), or an AX-12A"
+USE_PROTOCOL_2 = (
+    "Install the firmware of the model whose name ends with (2.0) with DYNAMIXEL Wizard 2.0 (Firmware Recovery)"
+)
 
 _PACKAGE, _FOLDER = "dynamixel_easy_sdk", "control_table"
 # Names that differ between the .model files and the e-manual.
 _RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdog"}
-# The driver uses none of these registers, and the models with a Present Current have no Present Load.
-_UNUSED = ("LED", "Indirect", "Present Load")
+
+_UNLISTED: Final = {1280: "xw430_t200"}  # e-manual, XW430-T200: the SDK has its file, but not its number
+
+FACTORY_PROTOCOL_1: Final = {29: "mx_28", 310: "mx_64", 320: "mx_106"}
+"""Model Numbers with the factory's firmware for Protocol 1.0 (e-manual, MX series); with that for 2.0 it is another."""
+
+# The registers that the driver uses, by protocol. With Protocol 2.0 also the load: see `DynamixelModel.missing`.
+_USED: Final = {
+    2: (
+        *("Model Number", "Firmware Version", "ID", "Baud Rate", "Return Delay Time", "Drive Mode", "Operating Mode"),
+        *("Secondary ID", "Homing Offset", "Temperature Limit", "Max Voltage Limit", "Min Voltage Limit"),
+        *("Velocity Limit", "Max Position Limit", "Min Position Limit", "Shutdown", "Torque Enable"),
+        *("Status Return Level", "Hardware Error Status", "Bus Watchdog", "Profile Acceleration", "Profile Velocity"),
+        *("Goal Position", "Realtime Tick", "Moving", "Moving Status", "Present Velocity", "Present Position"),
+        *("Position Trajectory", "Present Input Voltage", "Present Temperature"),
+    ),
+    1: (
+        *("Model Number", "Firmware Version", "ID", "Baud Rate", "Return Delay Time", "CW Angle Limit"),
+        *("CCW Angle Limit", "Temperature Limit", "Min Voltage Limit", "Max Voltage Limit", "Status Return Level"),
+        *("Shutdown", "Torque Enable", "Goal Position", "Moving Speed", "Present Position", "Present Speed"),
+        *("Present Load", "Present Voltage", "Present Temperature", "Moving"),
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DynamixelModel:
+    """A row of the table; angles and rates are those of the servo's own shaft, and 0 is an unknown unit.
+
+    ``name`` is the value of ``servo.model``, ``number`` its Model Number. ``registers`` are address, size and e-manual
+    name of each register. ``zero_counts`` is the middle of a revolution. ``multi_turn_counts`` is the largest goal in
+    each direction in extended position mode, 0 if the model counts no revolutions. ``dps2_per_unit`` is the unit of
+    Profile Acceleration; a model without this register always accelerates at this rate.
+    """
+
+    name: str
+    number: int
+    protocol: int
+    registers: tuple[tuple[int, int, str], ...]
+    deg_per_count: float = 0.0
+    zero_counts: int = 0
+    multi_turn_counts: int = 0
+    dps_per_unit: float = 0.0
+    dps2_per_unit: float = 0.0
+    ma_per_unit: float = 0.0
+    pwm_percent_per_unit: float = 0.0
+    load_percent_per_unit: float = 0.1
+    v_per_unit: float = 0.1
+    c_per_unit: float = 1.0
+
+    @property
+    def counts_per_revolution(self) -> int:
+        return round(360.0 / self.deg_per_count)
+
+    @property
+    def ram_start(self) -> int:
+        """Address of the first register that is lost without supply."""
+        return next(address for address, _, name in self.registers if name == "Torque Enable")
+
+    def missing(self) -> tuple[str, ...]:
+        """Return the registers and units that the driver uses and the row lacks."""
+        names = {name for _, _, name in self.registers}
+        units = {"Goal Position": self.deg_per_count, "speed": self.dps_per_unit, "acceleration": self.dps2_per_unit}
+        lacks = [name for name in _USED[self.protocol] if name not in names]
+        if "Present Current" in names:
+            lacks += [] if "Current Limit" in names else ["Current Limit"]
+            units["Present Current"] = self.ma_per_unit
+        elif "Present Load" not in names:
+            lacks.append("Present Load")
+        return *lacks, *(f"unit of {what}" for what, unit in units.items() if not unit)
+
+
+_X: Final[dict[str, Any]] = {
+    "dps2_per_unit": 214.577 * 6.0 / 60.0,  # 214.577 rev/min²
+    "multi_turn_counts": 1_048_575,
+    "pwm_percent_per_unit": 0.113,
+}
+# e-manual, Profile Acceleration, Goal Position, Current Limit and PWM Limit of each series; by beginnings of the names.
+_SERIES: Final[dict[tuple[str, ...], dict[str, Any]]] = {
+    ("xl330", "xc330"): _X | {"ma_per_unit": 1.0},
+    ("mx_",): _X | {"ma_per_unit": 3.36},
+    ("x", "2x"): _X | {"ma_per_unit": 2.69},
+    ("ph", "pm", "h42", "h54", "m42", "m54"): {
+        "dps2_per_unit": 6.0 / 60.0,  # 1 rev/min²
+        "multi_turn_counts": 2**31 - 1,
+        "ma_per_unit": 1.0,
+        "pwm_percent_per_unit": 0.0498,
+    },
+}
+
+AX_12A = DynamixelModel(  # e-manual, AX-12A; the SDK has no file of it. No value is signed: bit 10 is the direction.
+    "ax_12a",
+    12,
+    1,
+    (
+        (0, 2, "Model Number"),
+        (2, 1, "Firmware Version"),
+        (3, 1, "ID"),
+        (4, 1, "Baud Rate"),
+        (5, 1, "Return Delay Time"),
+        (6, 2, "CW Angle Limit"),
+        (8, 2, "CCW Angle Limit"),
+        (11, 1, "Temperature Limit"),
+        (12, 1, "Min Voltage Limit"),
+        (13, 1, "Max Voltage Limit"),
+        (14, 2, "Max Torque"),
+        (16, 1, "Status Return Level"),
+        (17, 1, "Alarm LED"),
+        (18, 1, "Shutdown"),
+        (24, 1, "Torque Enable"),
+        (25, 1, "LED"),
+        (26, 1, "CW Compliance Margin"),
+        (27, 1, "CCW Compliance Margin"),
+        (28, 1, "CW Compliance Slope"),
+        (29, 1, "CCW Compliance Slope"),
+        (30, 2, "Goal Position"),
+        (32, 2, "Moving Speed"),
+        (34, 2, "Torque Limit"),
+        (36, 2, "Present Position"),
+        (38, 2, "Present Speed"),
+        (40, 2, "Present Load"),
+        (42, 1, "Present Voltage"),
+        (43, 1, "Present Temperature"),
+        (44, 1, "Registered"),
+        (46, 1, "Moving"),
+        (47, 1, "Lock"),
+        (48, 2, "Punch"),
+    ),
+    deg_per_count=300.0 / 1023,
+    zero_counts=512,
+    dps_per_unit=0.111 * 6.0,
+    dps2_per_unit=2000.0,  # its fastest acceleration, estimated from its 354 °/s, because no document states it
+)
 
 
 def model_file_exists(name: str) -> bool:
@@ -31,48 +163,58 @@ def model_file_exists(name: str) -> bool:
     return files(_PACKAGE).joinpath(_FOLDER, f"{name}.model").is_file()
 
 
-def model_registers(name: str) -> dict[str, tuple[int, int]]:
-    """Return address and size of each register in a file of the SDK, by the name of the e-manual."""
-    return {_RENAMED.get(row[2], row[2]): (int(row[0]), int(row[1])) for row in _rows(name, "control table")}
+@cache
+def model_numbers() -> Mapping[int, str]:
+    """Return the models of the SDK, and the AX-12A, by their Model Number."""
+    listed = {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel", "")}
+    return {**listed, **_UNLISTED, AX_12A.number: AX_12A.name}
 
 
 @cache
-def sdk_models() -> Mapping[int, str]:
-    """Return the models of the SDK by their Model Number."""
-    return {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel", "")}
+def known_model(name: str, file: str = "") -> DynamixelModel | None:
+    """Return the row of a model of the SDK, or of the AX-12A; None for other names.
+
+    ``file`` is another `.model` file of the same model.
+    """
+    number = next((number for number, known in model_numbers().items() if known == name), None)
+    if number is None or name == AX_12A.name:
+        return None if number is None else AX_12A
+    kind = {row[0]: float(row[1]) for row in _rows(file or name, "type info")}
+    units = {row[0]: float(row[1]) for row in _rows(file or name, "unit info")}
+    zero, low = kind["value_of_zero_radian_position"], kind["value_of_min_radian_position"]
+    return DynamixelModel(
+        name,
+        number,
+        2,
+        tuple((int(row[0]), int(row[1]), _RENAMED.get(row[2], row[2])) for row in _rows(file or name, "control table")),
+        # The highest position is not a whole revolution in all files. -min_radian is rounded to eight digits.
+        deg_per_count=360.0 / round((zero - low) * 2 * pi / -kind["min_radian"]),
+        zero_counts=int(zero),
+        # The file has rad/s; the e-manual's unit, in rev/min, has three digits.
+        dps_per_unit=round(units["Goal Velocity"] * 30 / pi, 3) * 6.0,
+        **next((more for beginnings, more in _SERIES.items() if name.startswith(beginnings)), {}),
+    )
 
 
-@cache
-def differences(model: str) -> tuple[str, ...]:
-    """Return what prevents the driver from driving a model of the SDK; empty if it fits, and for all other names."""
-    if model == REFERENCE or model not in sdk_models().values():
-        return ()
-    found = []
-    (least, most), (low_rad, high_rad) = _range(model)
-    if _range(model) != _range(REFERENCE):
-        counts = round((most - least) / (high_rad - low_rad) * 2 * pi)
-        found.append(f"a revolution has {counts} counts instead of 4096")
-    if (units_rpm := _speed_units_rpm(model)) != (usual_rpm := _speed_units_rpm(REFERENCE)):
-        found.append(f"speeds count in {units_rpm[0]:.3g} rpm instead of {usual_rpm[0]:.3g} rpm")
-    registers = model_registers(model)
-    needed = {name: at for name, at in model_registers(REFERENCE).items() if not name.startswith(_UNUSED)}
-    if "Present Load" not in registers:
-        needed |= {"Present Current": model_registers(REFERENCE)["Present Load"], "Current Limit": (38, 2)}
-    if elsewhere := sum(registers.get(name) != at for name, at in needed.items()):
-        found.append(f"{elsewhere} registers are missing or have another address")
-    return tuple(found)
+def lacks(row: DynamixelModel) -> str:
+    """Return what a row lacks; empty if it is complete."""
+    missing = row.missing()
+    more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
+    return f"its row in the table of models lacks {', '.join(missing[:5])}{more}" if missing else ""
 
 
 def driven(model: str) -> str:
     """Return the value of ``servo.model``; raises ValueError for an unknown model, or one that no driver fits."""
-    models = [OWN, *sdk_models().values()]
-    if model not in models:
-        models += (point.name for point in entry_points(group=GROUP))  # only now, because looking them up takes 10 ms
-    if model not in models:
-        near = difflib.get_close_matches(model, [name for name in models if not differences(name)], n=1)
+    row = known_model(model)
+    if row is not None:
+        if reason := lacks(row):
+            raise ValueError(f"the rig cannot drive this model: {reason}. {USE_ANOTHER}")
+        return model
+    points = [point.name for point in entry_points(group=GROUP)]  # only now, because looking them up takes 10 ms
+    if model not in points:
+        known = [row.name for name in model_numbers().values() if (row := known_model(name)) and not row.missing()]
+        near = difflib.get_close_matches(model.lower().replace("-", "_"), [*known, *points], n=1)
         raise ValueError("unknown model" + (f"; did you mean {near[0]}?" if near else "; `rig find` names yours"))
-    if reasons := differences(model):
-        raise ValueError(f"the rig cannot drive this model: {'; '.join(reasons)}. {USE_ANOTHER}")
     return model
 
 
@@ -82,16 +224,3 @@ def _rows(name: str, section: str) -> list[list[str]]:
     body = text.partition(f"[{section}]")[2] if section else text
     lines = body.partition("\n[")[0].strip().splitlines()[1:]
     return [line.split("\t") for line in lines if line.strip()]
-
-
-def _range(model: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the lowest and the highest position of a model, in counts and in radians."""
-    values = {row[0]: float(row[1]) for row in _rows(model, "type info")}
-    counts = values["value_of_min_radian_position"], values["value_of_max_radian_position"]
-    return counts, (values["min_radian"], values["max_radian"])
-
-
-def _speed_units_rpm(model: str) -> tuple[float, float]:
-    """Return the units of Goal Velocity and Present Velocity in revolutions per minute."""
-    units = {row[0]: float(row[1]) * 30 / pi for row in _rows(model, "unit info")}
-    return units["Goal Velocity"], units["Present Velocity"]

@@ -16,7 +16,7 @@ from rig.core.clock import Clock
 from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
-from rig.devices.dynamixel.registers import model_of, obstacle
+from rig.devices.dynamixel.registers import model_of, model_row, obstacle
 from rig.devices.i2c import NO_DEVICE, STUCK, unbind_command
 from rig.doctor.finding import Finding, FindingCode, bad
 
@@ -30,12 +30,12 @@ _PING_ANSWER = 14
 _LISTEN_S = 0.05  # longer than an answer at the lowest rate; only a device that talks by itself sends in this time
 # two servos with one id collide in most readings, a bad cable in few: more than half of these tells them apart
 _STATUS_READS = 8
-_STATUS = (120, 27)  # realtime Tick to Present Temperature: two servos with the same id soon differ in these
+_STATUS, _STATUS_SIZE = "Realtime Tick", 27  # to Present Temperature: servos with the same id soon differ in these
 
 
 @dataclass(frozen=True, slots=True)
 class FoundServo:
-    """A servo that answered; ``model`` is None for an unknown number, ``obstacle`` empty if the rig can drive it."""
+    """A servo that answered; ``model`` is None for an unknown number; ``obstacle`` as in `registers.obstacle`."""
 
     bus_id: int
     baud: int
@@ -45,7 +45,7 @@ class FoundServo:
     firmware: int
 
     @property
-    def obstacle(self) -> str:
+    def obstacle(self) -> tuple[str, str] | None:
         return obstacle(self.model_number)
 
     def __str__(self) -> str:
@@ -109,10 +109,12 @@ def without_echoes(scans: Sequence[BaudScan], preferred: int) -> list[BaudScan]:
     return [next((each for each in scans if each.baud == preferred), scans[0])]
 
 
-def corrupt_reads(bus: DynamixelBus, bus_id: int) -> int:
+def corrupt_reads(bus: DynamixelBus, bus_id: int, model: str | None = None) -> int:
     """Return how many reads of a servo's status came back corrupt; the bus must not retry."""
     corrupt = 0
-    address, size = _STATUS if bus.protocol == 2 else (36, 8)
+    row = model_row(model) if model else None
+    places = {name: address for address, _, name in row.registers} if row else {}
+    address, size = (places.get(_STATUS, 120), _STATUS_SIZE) if bus.protocol == 2 else (36, 8)
     for _ in range(_STATUS_READS):
         try:
             bus.read_block(bus_id, address, size)
@@ -134,7 +136,9 @@ def _scan_2(port: ClockedPort, baud: int) -> BaudScan:
         return BaudScan(baud, 2, noise=True)
     servos = [_servo(bus_id, baud, 2, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
     bus = DynamixelBus(port, retries=0)
-    duplicate_ids = [servo.bus_id for servo in servos if corrupt_reads(bus, servo.bus_id) > _STATUS_READS // 2]
+    duplicate_ids = [
+        servo.bus_id for servo in servos if corrupt_reads(bus, servo.bus_id, servo.model) > _STATUS_READS // 2
+    ]
     # The SDK skips what it cannot read, and reports success. Answers of servos with the same id collide: if more bytes
     # came than belong to complete answers, ask each id separately.
     rest = len(listening.answered) - _PING_ANSWER * len(answers)

@@ -11,7 +11,6 @@ import serial
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.config import CameraConfig
-from rig.config.servos import USE_ANOTHER
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.core.next_steps import Do, SomeSteps
@@ -216,9 +215,8 @@ class DeviceScan:
         for found in scan.servos:
             place = {"port": port.path, "id": found.bus_id, "baud": found.baud}
             if found.obstacle:
-                yield warning(
-                    "servo", FindingCode.SERVO_NOT_DRIVEN, USE_ANOTHER, found=found, reason=found.obstacle, **place
-                )
+                reason, fix = found.obstacle
+                yield warning("servo", FindingCode.SERVO_NOT_DRIVEN, fix, found=found, reason=reason, **place)
                 continue
             self.servos.append((port, found))
             yield fine("servo", FindingCode.SERVO_FOUND, found=found, **place)

@@ -1,5 +1,6 @@
 """The meaning of a servo's registers, with the units of the e-manual."""
 
+from rig.config.servos import DynamixelModel
 from rig.core.phrases import angle_words, filled, number
 from rig.devices.dynamixel.registers import ControlTable
 from rig.devices.dynamixel.servo import hardware_errors
@@ -22,15 +23,15 @@ _STARTUP_BITS = ((0x01, "torque on at power-up"), (0x02, "RAM restored at power-
 _RETURN_LEVELS = {0: "answers to ping only", 1: "answers to ping and read", 2: "answers to everything"}
 _AX_ERRORS = ("input voltage", "angle limit", "overheating", "range", "checksum", "overload", "instruction")
 
-_SCALED = {
+_SCALED: dict[str, tuple[float | str, str]] = {
     "Return Delay Time": (2, "{:g} µs"),
     "Realtime Tick": (1, "{:g} ms"),
-    **dict.fromkeys(("Temperature Limit", "Present Temperature"), (1, "{:g} °C")),
-    **dict.fromkeys(("Max Voltage Limit", "Min Voltage Limit"), (0.1, "{:.1f} V")),
-    **dict.fromkeys(("Present Input Voltage", "Present Voltage"), (0.1, "{:.1f} V")),
-    **dict.fromkeys(("PWM Limit", "Goal PWM", "Present PWM"), (0.113, "{:.1f} %")),
+    **dict.fromkeys(("Temperature Limit", "Present Temperature"), ("c_per_unit", "{:g} °C")),
+    **dict.fromkeys(("Max Voltage Limit", "Min Voltage Limit"), ("v_per_unit", "{:.1f} V")),
+    **dict.fromkeys(("Present Input Voltage", "Present Voltage"), ("v_per_unit", "{:.1f} V")),
+    **dict.fromkeys(("PWM Limit", "Goal PWM", "Present PWM"), ("pwm_percent_per_unit", "{:.1f} %")),
 }
-"""Registers that count in a unit: its size, and the template of the value."""
+"""Registers that count in a unit: its size or its name in the model's row, and the template of the value."""
 
 _SWITCHES = {"Torque Enable", "LED", "Moving", "Registered Instruction", "Backup Ready", "Lock", "Registered"}
 _DEGREES = {
@@ -42,32 +43,31 @@ _VELOCITIES = {
     "Velocity Trajectory",
 }
 _CURRENTS = {"Current Limit", "Goal Current", "Present Current"}
-_MILLIAMPERES = {"xl330": 1.0, "xc330": 1.0, "xm430": 2.69, "xh430": 2.69, "xd430": 2.69, "xm540": 2.69, "xh540": 2.69}
-"""Unit of the currents by the first part of the model's name; unknown for other models."""
 
 
 def baud_codes(table: ControlTable) -> dict[int, int]:
     """Return the baud rates that a model can be set to, each with its register value."""
-    if table.ram_start != 64:
+    if table.row.protocol == 1:
         return {
             rate: round(AX_BAUD / rate) - 1
             for rate in (9_600, 19_200, 57_600, 115_200, 200_000, 250_000, 500_000, 1_000_000)
         }
-    fastest = 4_000_000 if table.model.startswith(("xl330", "xc330")) else 4_500_000
+    fastest = 4_000_000 if table.row.name.startswith(("xl330", "xc330")) else 4_500_000
     return {rate: code for rate, code in BAUD_CODES.items() if rate <= fastest}
 
 
 def meaning(table: ControlTable, name: str, value: int) -> str:
     """Return the meaning of a register's value; empty if the number needs none."""
+    row = table.row
     if name in _SCALED:
-        factor, template = _SCALED[name]
-        return filled(template, factor * value)
+        unit, template = _SCALED[name]
+        return filled(template, value * (getattr(row, unit) if isinstance(unit, str) else unit))
     if name in _SWITCHES:
         return "on" if value else "off"
     if name == "Status Return Level":
         return _RETURN_LEVELS.get(value, "unknown level")
-    if table.ram_start != 64:
-        return _ax_meaning(name, value)
+    if row.protocol == 1:
+        return _ax_meaning(row, name, value)
     match name:
         case "Baud Rate":
             return next((f"{rate} bit/s" for rate, code in BAUD_CODES.items() if code == value), "unknown rate")
@@ -88,23 +88,21 @@ def meaning(table: ControlTable, name: str, value: int) -> str:
         case "Bus Watchdog":
             return "off" if value == 0 else "tripped" if value in (0xFF, -1) else f"{20 * value} ms"
         case "Profile Acceleration":
-            return "as fast as it can" if value == 0 else f"{value * 214.577 * 6 / 60:.1f} °/s²"
+            return "as fast as it can" if value == 0 else f"{value * row.dps2_per_unit:.1f} °/s²"
         case "Profile Velocity" if value == 0:
             return "as fast as it can"
         case "Moving Status":
             return "arrived" if value & 1 else "not arrived"
         case "Present Load":
-            return f"{number(0.1 * value, '.1f')} %"
+            return f"{number(value * row.load_percent_per_unit, '.1f')} %"
     if name in _DEGREES:
-        return angle_words(value * 360 / 4096, 2)
+        return angle_words(value * row.deg_per_count, 2)
     if name in _VELOCITIES:
-        return f"{number(value * 0.229 * 6, '.2f')} °/s"
-    if name in _CURRENTS and (unit := _MILLIAMPERES.get(table.model.partition("_")[0])):
-        return f"{number(value * unit, '.0f')} mA"
-    return ""
+        return f"{number(value * row.dps_per_unit, '.2f')} °/s"
+    return f"{number(value * row.ma_per_unit, '.0f')} mA" if name in _CURRENTS else ""
 
 
-def _ax_meaning(name: str, value: int) -> str:
+def _ax_meaning(row: DynamixelModel, name: str, value: int) -> str:
     match name:
         case "Baud Rate":
             return f"{AX_BAUD / (value + 1):.0f} bit/s"
@@ -115,10 +113,10 @@ def _ax_meaning(name: str, value: int) -> str:
         case "Moving Speed" if value == 0:
             return "as fast as it can"
         case "Moving Speed" | "Present Speed":
-            return f"{(value & 0x3FF) * 0.111 * 6:.1f} °/s{' clockwise' if value & 0x400 else ''}"
+            return f"{(value & 0x3FF) * row.dps_per_unit:.1f} °/s{' clockwise' if value & 0x400 else ''}"
         case "Present Load":
             return f"{(value & 0x3FF) / 10.23:.0f} %{' clockwise' if value & 0x400 else ''}"
-    return f"{value * 300 / 1023:.1f}°" if name in _DEGREES else ""
+    return f"{value * row.deg_per_count:.1f}°" if name in _DEGREES else ""
 
 
 def _bits(value: int, names: tuple[tuple[int, str], ...], none: str) -> str:

@@ -5,13 +5,12 @@ from contextlib import ExitStack
 from typing import Any
 
 from rig.config import ServoConfig
-from rig.config.servos import USE_ANOTHER
+from rig.config.servos import FACTORY_PROTOCOL_1, DynamixelModel
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.registers import (
-    DynamixelModel,
     control_table,
     model_of,
     obstacle,
@@ -83,8 +82,11 @@ def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Find
     config = context.config.servo
     protocol = protocol_of(config.model)
     rates = BAUD_RATES if protocol == 2 else BAUD_RATES_1
+    asked = [(protocol, rate) for rate in (config.baud, *(rate for rate in rates if rate != config.baud))]
+    if config.model in FACTORY_PROTOCOL_1.values():
+        asked += [(1, rate) for rate in BAUD_RATES_1]
     answered: list[BaudScan] = []
-    for rate in [config.baud, *(rate for rate in rates if rate != config.baud)]:
+    for protocol, rate in asked:
         yield f"{config.port}: no servo at id {config.id}; scanning at {rate} baud ..."
         for scan in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
             if scan.duplicate_ids:
@@ -106,7 +108,7 @@ def _place(config: ServoConfig) -> dict[str, Any]:
 def _use(config: ServoConfig, there: FoundServo) -> SomeSteps:
     """Return the command that changes the configuration to the servo found, if the rig can drive it."""
     if there.obstacle:
-        return USE_ANOTHER
+        return there.obstacle[1]
     differing = {
         "servo.id": (config.id, there.bus_id),
         "servo.baud": (config.baud, there.baud),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from rig.devices.dynamixel.registers import number_of
+from rig.devices.dynamixel.registers import control_table
 from sim.servo.base import SimulatedServoBase
 from sim.servo.models import ServoModel
 from sim.servo.protocol1 import Error
@@ -188,7 +188,7 @@ class Ax12Servo(SimulatedServoBase):
             known = ", ".join(map(str, sorted(BAUD_RATES.values())))
             raise ValueError(f"an AX-12A has no baud rate {baudrate}: choose one of {known}")
         super().__init__(shaft, model)
-        self.memory = Image(number_of(model.name))
+        self.memory = Image(control_table(model.name).row.number)
         self.memory["ID"] = bus_id
         self.memory["Baud Rate"] = next(n for n, rate in BAUD_RATES.items() if rate == baudrate)
         self._shaft = shaft

@@ -2,12 +2,11 @@
 
 from collections.abc import Iterator
 
-from rig.devices.dynamixel.registers import ControlTable, Register, control_table, number_of
+from rig.devices.dynamixel.registers import ControlTable, Register, control_table
 from sim.servo.models import ServoModel
 from sim.servo.protocol2 import StatusError
 
-RAM_START = 64  # addresses below it are EEPROM: kept without power, locked while torque is on
-FIRST_LIVE_REGISTER = 120  # from Realtime Tick on, registers follow the world
+MOST_INDIRECT = 128  # e-manual, Indirect Address of the P series
 
 _READ_ONLY = frozenset(
     {
@@ -30,12 +29,18 @@ class InstructionRejected(Exception):
 class Memory:
     """Control table of a servo; values by register name, signed if the register is.
 
-    A byte of Indirect Data is the byte at its Indirect Address.
+    A byte of Indirect Data is the byte at its Indirect Address. Addresses below `ram_start` are EEPROM: kept without
+    power, locked while torque is on. From `live_start` (Realtime Tick) on, registers follow the world. `turn` are the
+    positions within one revolution.
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
         table = control_table(model.name, firmware)
-        self._model = model
+        row = self.row = table.row
+        self.ram_start, self.live_start = table.ram_start, table["Realtime Tick"].address
+        lowest = row.zero_counts - row.counts_per_revolution // 2
+        self.turn = range(lowest, lowest + row.counts_per_revolution)
+        self._ranges = {**model.ranges, "Min Position Limit": self.turn, "Max Position Limit": self.turn}
         self._registers = {register.name: register for register in _plain(table)}
         self._indirect: dict[int, Register] = {}
         for first, data, count in _indirect_blocks(table):
@@ -50,8 +55,9 @@ class Memory:
         self._image = bytearray(self._size)
         last = self._registers["Present Temperature"]
         self._live_end = last.address + last.size
-        identity = {"Firmware Version": firmware, "Model Number": number_of(model.name)}
-        self._defaults = {**model.initial, **identity}
+        identity = {"Firmware Version": firmware, "Model Number": row.number}
+        limits = {"Min Position Limit": self.turn[0], "Max Position Limit": self.turn[-1]}
+        self._defaults = {**limits, **model.initial, **identity}
         for address, pointer in self._indirect.items():
             self._defaults[pointer.name] = address
         self._restore(0, self._size)
@@ -70,11 +76,11 @@ class Memory:
 
     def live(self) -> bytes:
         """Return the registers that follow the world, as one block."""
-        return bytes(self._image[FIRST_LIVE_REGISTER : self._live_end])
+        return bytes(self._image[self.live_start : self._live_end])
 
     def set_live(self, block: bytes) -> None:
         """Set the registers that follow the world, in the order of `live`."""
-        self._image[FIRST_LIVE_REGISTER : self._live_end] = block
+        self._image[self.live_start : self._live_end] = block
 
     @property
     def starts_with_torque(self) -> bool:
@@ -83,7 +89,7 @@ class Memory:
 
     def forget_ram(self) -> None:
         """Set the RAM area to its initial values, as at power-up."""
-        self._restore(RAM_START, self._size)
+        self._restore(self.ram_start, self._size)
 
     def forget_all(self, keep: tuple[str, ...] = ()) -> None:
         """Set all registers except those named in ``keep`` to their initial values."""
@@ -105,7 +111,7 @@ class Memory:
         if address + size > self._size:
             raise InstructionRejected(StatusError.ACCESS)
         data = bytes(self._image[address : address + size])
-        if address + size > RAM_START and not self._indirect.keys().isdisjoint(range(address, address + size)):
+        if address + size > self.ram_start and not self._indirect.keys().isdisjoint(range(address, address + size)):
             return bytes(self._image[self._resolve(a)] for a in range(address, address + size))
         return data
 
@@ -142,8 +148,8 @@ class Memory:
 
     def _takes(self, register: Register, value: int) -> bool:
         if register.name.startswith("Indirect Address"):
-            return RAM_START <= value < self._size
-        allowed = self._model.ranges.get(register.name)
+            return self.ram_start <= value < self._size
+        allowed = self._ranges.get(register.name)
         return allowed is None or value in allowed
 
     def _resolve(self, address: int) -> int:
@@ -173,7 +179,7 @@ def _indirect_blocks(table: ControlTable) -> Iterator[tuple[int, int, int]]:
     if "Indirect Address 1" not in table:
         return
     first, data = table["Indirect Address 1"].address, table["Indirect Data 1"].address
-    count = (data - first) // 2
+    count = min((data - first) // 2, MOST_INDIRECT)
     yield first, data, count
     second, second_data = table["Indirect Address Read"].address, table["Indirect Data Read"].address
     if second >= data + count:

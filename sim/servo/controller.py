@@ -4,23 +4,12 @@ from enum import IntEnum
 from math import cos, radians, sin
 
 from sim.servo.control_table import Memory
-from sim.servo.models import (
-    COUNTS_PER_REVOLUTION,
-    DEG_PER_COUNT,
-    DPS2_PER_UNIT,
-    DPS_PER_UNIT,
-    EXTENDED_POSITION_MODE,
-    GAINS,
-    POSITION_MODE,
-    PWM_FULL,
-    VELOCITY_MODE,
-    ServoModel,
-)
+from sim.servo.models import EXTENDED_POSITION_MODE, GAINS, POSITION_MODE, VELOCITY_MODE, ServoModel
 from sim.servo.motor import Motor
 from sim.servo.shaft import Shaft
 
-IN_POSITION_COUNTS = 4
-FOLLOWING_ERROR_COUNTS = 100  # the e-manual calls these two thresholds of Moving Status predefined and states no values
+# the e-manual calls these two thresholds of Moving Status predefined and states no values
+IN_POSITION_DEG, FOLLOWING_ERROR_DEG = 0.36, 8.8
 SINGLE_TURN_HOMING_COUNTS = 1024  # a larger Homing Offset is ignored in position mode
 TICK_MODULUS_MS = 32_768
 
@@ -39,7 +28,7 @@ class Profile(IntEnum):
 class Controller:
     """Converts the goal registers to trajectories of the motor.
 
-    Position registers count steps of `DEG_PER_COUNT` from the encoder's zero, in the direction of Drive Mode. Whole
+    Position registers count the steps of the model's row from the encoder's zero, in the direction of Drive Mode. Whole
     revolutions are counted until `wrap_position`, as in the e-manual. Gains, PWM and current limits are stored but have
     no effect. `harmonics_deg` is the encoder's error over a revolution: cosine and sine of the first and the second
     harmonic.
@@ -50,6 +39,8 @@ class Controller:
         self._memory = memory
         self._motor = motor
         self._model = model
+        self._row = memory.row
+        self._pwm_full = memory["PWM Limit"]
         self._center = center_counts
         self._rng = world.rng(f"servo-{memory['ID']}")
         part = world.rng(f"servo-{memory['ID']}-part")
@@ -101,7 +92,7 @@ class Controller:
             return
         goal_deg = self._degrees(self._memory["Goal Position"])
         velocity, acceleration = self._memory["Profile Velocity"], self._memory["Profile Acceleration"]
-        v_max = min(self._motor.fastest_dps, self._memory["Velocity Limit"] * DPS_PER_UNIT)
+        v_max = min(self._motor.fastest_dps, self._memory["Velocity Limit"] * self._row.dps_per_unit)
         a_max = self._motor.steepest_dps2
         if velocity and self._time_based:
             ramp_s = min(acceleration, velocity / 2) * 1e-3
@@ -109,8 +100,8 @@ class Controller:
             v_max = min(v_max, distance / (velocity * 1e-3 - ramp_s))
             a_max = min(a_max, v_max / ramp_s) if ramp_s else a_max
         elif velocity:
-            v_max = min(v_max, velocity * DPS_PER_UNIT)
-            a_max = min(a_max, acceleration * DPS2_PER_UNIT) if acceleration else a_max
+            v_max = min(v_max, velocity * self._row.dps_per_unit)
+            a_max = min(a_max, acceleration * self._row.dps2_per_unit) if acceleration else a_max
         self._motor.go_to(goal_deg, max(v_max, _STANDSTILL), max(a_max, _STANDSTILL))
         if not velocity:
             self._profile = Profile.STEP
@@ -125,25 +116,25 @@ class Controller:
         if self._memory["Operating Mode"] != VELOCITY_MODE:
             return
         fastest = self._motor.fastest_dps
-        goal_dps = min(max(self._sign * self._memory["Goal Velocity"] * DPS_PER_UNIT, -fastest), fastest)
+        goal_dps = min(max(self._sign * self._memory["Goal Velocity"] * self._row.dps_per_unit, -fastest), fastest)
         acceleration, a_max = self._memory["Profile Acceleration"], self._motor.steepest_dps2
         if acceleration and self._time_based:
             a_max = min(a_max, abs(goal_dps - self._motor.state().target_dps) / (acceleration * 1e-3))
         elif acceleration:
-            a_max = min(a_max, acceleration * DPS2_PER_UNIT)
+            a_max = min(a_max, acceleration * self._row.dps2_per_unit)
         self._motor.rotate_at(goal_dps, max(a_max, _STANDSTILL))
         self._profile = Profile.TRAPEZOIDAL if acceleration else Profile.STEP
 
     def wrap_position(self) -> None:
         """Reset the count of revolutions: the position continues from within one revolution."""
         self._revolution_counts = 0
-        present = self._present_position() - self._homing
-        self._revolution_counts = present - present % COUNTS_PER_REVOLUTION
+        turn = self._memory.turn
+        self._revolution_counts = (self._present_position() - self._homing - turn.start) // len(turn) * len(turn)
         self._memory["Goal Position"] = self._present_position()
 
     def slip_encoder(self, angle_deg: float) -> None:
         """Increase the encoder's reading by ``angle_deg``, and go to the goal by the new reading."""
-        self._center += round(angle_deg / DEG_PER_COUNT)
+        self._center += round(angle_deg / self._row.deg_per_count)
         if self._motor.driven:
             self.pursue_position()
 
@@ -153,7 +144,7 @@ class Controller:
         """Update the registers that follow the world."""
         memory, motor, state = self._memory, self._motor, self._motor.state()
         present, target = self._present_position(), self._counts(state.target_deg)
-        velocity = self._sign * round(state.speed_dps / DPS_PER_UNIT)
+        velocity = self._sign * round(state.speed_dps / self._row.dps_per_unit)
         status = self._moving_status(present, target)
         noise_v = self._world.noise.voltage_noise_v
         voltage = motor.terminal_v(state.load) + (noise_v * self._rng.standard_normal() if noise_v else 0.0)
@@ -161,16 +152,16 @@ class Controller:
         memory["Realtime Tick"] = elapsed_ms % TICK_MODULUS_MS
         memory["Moving"] = int(bool(status & 0x02) or abs(velocity) > memory["Moving Threshold"])
         memory["Moving Status"] = status
-        memory["Present PWM"] = self._sign * round(state.pwm * PWM_FULL)
+        memory["Present PWM"] = self._sign * round(state.pwm * self._pwm_full)
         if self._model.stall_current is None:
-            memory["Present Load"] = self._sign * round(state.load * 1000)
+            memory["Present Load"] = self._sign * round(state.load * 100 / self._row.load_percent_per_unit)
         else:
             memory["Present Current"] = self._sign * round(state.load * self._model.stall_current)
         memory["Present Velocity"] = velocity
         memory["Present Position"] = present
-        memory["Velocity Trajectory"] = self._sign * round(state.target_dps / DPS_PER_UNIT)
+        memory["Velocity Trajectory"] = self._sign * round(state.target_dps / self._row.dps_per_unit)
         memory["Position Trajectory"] = target
-        memory["Present Input Voltage"] = max(round(voltage * 10), 0)
+        memory["Present Input Voltage"] = max(round(voltage / self._row.v_per_unit), 0)
         memory["Present Temperature"] = min(max(round(motor.temperature_c(state.load)), 0), 255)
 
     def _moving_status(self, present: int, target: int) -> int:
@@ -179,9 +170,9 @@ class Controller:
         profile = self._profile << 4
         if self._memory["Operating Mode"] == VELOCITY_MODE:
             return profile
-        in_position = abs(self._memory["Goal Position"] - present) <= IN_POSITION_COUNTS
+        in_position = abs(self._memory["Goal Position"] - present) * self._row.deg_per_count < IN_POSITION_DEG
         ongoing = self._profile != Profile.STEP and self._motor.profile_ongoing
-        following_error = abs(target - present) > FOLLOWING_ERROR_COUNTS
+        following_error = abs(target - present) * self._row.deg_per_count > FOLLOWING_ERROR_DEG
         return profile | following_error << 3 | ongoing << 1 | in_position
 
     # -- scales ---------------------------------------------------------------------------------------------------
@@ -203,11 +194,17 @@ class Controller:
     def _counts(self, angle_deg: float) -> int:
         """Return the value of a position register at a shaft angle."""
         read_deg = angle_deg + self._encoder_error_deg(angle_deg)
-        return self._sign * round(read_deg / DEG_PER_COUNT + self._center) - self._revolution_counts + self._homing
+        return (
+            self._sign * round(read_deg / self._row.deg_per_count + self._center)
+            - self._revolution_counts
+            + self._homing
+        )
 
     def _degrees(self, counts: int) -> float:
         """Return the shaft angle at which a position register reads ``counts``."""
-        read_deg = (self._sign * (counts - self._homing + self._revolution_counts) - self._center) * DEG_PER_COUNT
+        read_deg = (
+            self._sign * (counts - self._homing + self._revolution_counts) - self._center
+        ) * self._row.deg_per_count
         angle_deg = read_deg
         for _ in range(3):  # the error changes by a hundredth of the angle at most
             angle_deg = read_deg - self._encoder_error_deg(angle_deg)

@@ -4,18 +4,17 @@ from collections.abc import Callable
 
 from rig.devices.dynamixel.registers import Register
 from sim.servo.base import OVERLOAD_ERROR, SimulatedServoBase
-from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, InstructionRejected, Memory
+from sim.servo.control_table import InstructionRejected, Memory
 from sim.servo.controller import Controller
-from sim.servo.models import BAUD_RATES, COUNTS_PER_REVOLUTION, POSITION_MODE, servo_model
+from sim.servo.models import BAUD_RATES, POSITION_MODE, servo_model
 from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, StatusError, StatusPacket
 from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
 from sim.servo.shaft import Shaft
 
 WATCHDOG_UNIT_NS = 20_000_000  # 20 ms; the e-manual's page of the XM430 prints µs
 WATCHDOG_TRIPPED = 0xFF
-EXTENDED_RANGE_COUNTS = 1_048_575
 
-_TORQUE_BY_GOAL = 0x08  # bit of Drive Mode
+_TIME_BASED, _TORQUE_BY_GOAL = 0x04, 0x08  # bits of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 # e-manual, Protocol 2.0, Clear: 0x01, and four bytes that no other packet has by chance
 _CLEAR_MULTI_TURN = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
@@ -38,7 +37,7 @@ class XSeriesServo(SimulatedServoBase):
     firmware
         Firmware Version; default: that of the model.
     center_counts
-        The encoder's reading at the shaft's angle 0.
+        The encoder's reading at the shaft's angle 0; default: the middle of its revolution.
 
     Raises
     ------
@@ -57,7 +56,7 @@ class XSeriesServo(SimulatedServoBase):
         bus_id: int = 1,
         baudrate: int = 57_600,
         firmware: int | None = None,
-        center_counts: int = COUNTS_PER_REVOLUTION // 2,
+        center_counts: int | None = None,
     ) -> None:
         row = servo_model(model)
         if baudrate not in BAUD_RATES:
@@ -68,7 +67,8 @@ class XSeriesServo(SimulatedServoBase):
         self.memory = Memory(self.model, self.model.firmware if firmware is None else firmware)
         self.memory["ID"] = bus_id
         self.memory["Baud Rate"] = BAUD_RATES.index(baudrate)
-        self._controller = Controller(world, self.memory, self.motor, self.model, center_counts)
+        center = self.memory.row.zero_counts if center_counts is None else center_counts
+        self._controller = Controller(world, self.memory, self.motor, self.model, center)
         self._heard_ns = 0
         self._on_write: dict[str, Callable[[], None]] = {
             "Drive Mode": self._controller.wrap_position,
@@ -152,7 +152,7 @@ class XSeriesServo(SimulatedServoBase):
         return StatusPacket(error | (ALERT if self.memory["Hardware Error Status"] else 0), data)
 
     def _read(self, address: int, size: int) -> bytes:
-        if address + size > FIRST_LIVE_REGISTER:
+        if address + size > self.memory.live_start:
             self._controller.refresh()
             for distort in self.distortions:
                 distort(self.memory)
@@ -171,7 +171,7 @@ class XSeriesServo(SimulatedServoBase):
         locked = in_group or self.memory["Torque Enable"]
         tripped = self.memory["Bus Watchdog"] == WATCHDOG_TRIPPED
         for register, value in entries:
-            if register.address < RAM_START and locked:
+            if register.address < self.memory.ram_start and locked:
                 raise InstructionRejected(StatusError.ACCESS)
             if tripped and (register.name in _GOALS or (register.name == "Bus Watchdog" and value)):
                 raise InstructionRejected(StatusError.DATA_RANGE)
@@ -186,10 +186,15 @@ class XSeriesServo(SimulatedServoBase):
             case "Goal Position" if memory["Operating Mode"] == POSITION_MODE:
                 return memory["Min Position Limit"], memory["Max Position Limit"]
             case "Goal Position":
-                return -EXTENDED_RANGE_COUNTS, EXTENDED_RANGE_COUNTS
+                return -memory.row.multi_turn_counts, memory.row.multi_turn_counts
             case "Goal Velocity" | "Goal PWM" | "Goal Current":
                 limit = memory[name.removeprefix("Goal ") + " Limit"]
                 return -limit, limit
+            # e-manual, P series and MX (2.0): the models with an Acceleration Limit limit their profile
+            case "Profile Velocity" | "Profile Acceleration" if (
+                "Acceleration Limit" in memory and not memory["Drive Mode"] & _TIME_BASED
+            ):
+                return 0, memory[name.removeprefix("Profile ") + " Limit"]
         return value, value
 
     # -- for tests and faults -------------------------------------------------------------------------------------

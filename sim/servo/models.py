@@ -1,25 +1,21 @@
 """The differences between servo models as data: initial values, ranges, speed, current.
 
-Source: the e-manual's control tables and specifications of each model. For another X-series or MX (2.0) model, add a
-`ServoModel`; its register addresses come from the SDK's `.model` file.
+Source: the e-manual's control tables and specifications of each model. Registers, resolution and units are those of the
+model's row in `rig.config.servos`. Each model that the rig drives can be simulated: one without a `ServoModel` has the
+limits, speed and current of the model most like it.
 """
 
 from collections.abc import Container, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
+from rig.config.servos import DynamixelModel, known_model
 from rig.core.plugins import plugins
 
 GROUP = "rig.simulated_servos"
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate."""
-
-COUNTS_PER_REVOLUTION = 4096
-DEG_PER_COUNT = 360.0 / COUNTS_PER_REVOLUTION
-DPS_PER_UNIT = 0.229 * 6.0  # velocity registers count in 0.229 rev/min
-DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # profile Acceleration counts in 214.577 rev/min²
-PWM_FULL = 885  # goal and Present PWM at 100 %
 
 VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE = 1, 3, 4
 
@@ -39,9 +35,8 @@ _INITIAL = {
     "Protocol Type": 2,
     "Homing Offset": 0,
     "Moving Threshold": 10,
-    "PWM Limit": PWM_FULL,
-    "Max Position Limit": COUNTS_PER_REVOLUTION - 1,
-    "Min Position Limit": 0,
+    "PWM Limit": 885,
+    "Acceleration Limit": 32_767,
     "Shutdown": 52,
     "Status Return Level": 2,
 }
@@ -57,10 +52,9 @@ _RANGES: dict[str, Container[int]] = {
     "Homing Offset": range(-1_044_479, 1_044_480),
     "Moving Threshold": range(1024),
     "Temperature Limit": range(101),
-    "PWM Limit": range(PWM_FULL + 1),
+    "PWM Limit": range(886),
+    "Acceleration Limit": range(32_768),
     "Velocity Limit": range(1024),
-    "Max Position Limit": range(COUNTS_PER_REVOLUTION),
-    "Min Position Limit": range(COUNTS_PER_REVOLUTION),
     "Torque Enable": range(2),
     "LED": range(2),
     "Status Return Level": range(3),
@@ -79,7 +73,7 @@ class ServoModel:
     Attributes
     ----------
     name
-        Name of its `.model` file, which contains the registers.
+        Name of its row in `rig.config.servos`.
     firmware
         Firmware of a new servo.
     initial
@@ -194,8 +188,35 @@ _MODELS = (
         voltage=(95, 160),
         velocity=230,
         gains=(1920, 100, 850),
-        initial={"Acceleration Limit": 32_767},
-        ranges={"Drive Mode": frozenset({0, 1, 4, 5}), "Acceleration Limit": range(32_768)},
+        ranges={"Drive Mode": frozenset({0, 1, 4, 5})},
+    ),
+    _model(
+        "ph54_200_s500",
+        13,  # the e-manual names no firmware
+        supply_v=24.0,
+        no_load_rpm=33.1,
+        temperature=80,
+        voltage=(150, 350),
+        velocity=2900,
+        gains=(2209, 6153, 314),
+        initial={
+            "Moving Threshold": 20,
+            "PWM Limit": 2009,
+            "Current Limit": 22_740,
+            "Acceleration Limit": 3_992_644,
+        },
+        ranges={
+            "Homing Offset": range(-(2**31), 2**31),
+            "Moving Threshold": range(2901),
+            "PWM Limit": range(2010),
+            "Current Limit": range(22_741),
+            "Acceleration Limit": range(3_992_645),
+            "Velocity Limit": range(2901),
+            **dict.fromkeys(GAINS, range(32_768)),
+            "Profile Acceleration": range(3_992_645),
+            "Profile Velocity": range(2901),
+        },
+        stall_current=22_740,
     ),
 )
 MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})
@@ -210,6 +231,18 @@ def servo_model(name: str) -> ServoModel:
         There is none.
     """
     model = MODELS.get(name) or dict(plugins(GROUP)).get(name)
-    if model is None:
+    if model is not None:
+        return model
+    row = known_model(name)
+    if row is None or row.protocol == 1 or row.missing():
         raise ValueError(f"no simulated servo {name!r}: choose one of {', '.join(MODELS)}")
-    return model
+    return replace(MODELS[_relative(row)], name=name)
+
+
+def _relative(row: DynamixelModel) -> str:
+    """Return the simulated model that is most like another one."""
+    if row.counts_per_revolution > 4096:
+        return "ph54_200_s500"
+    if row.name.startswith(("xl330", "xc330")):
+        return "xl330_m288"
+    return "xm430_w350" if any(name == "Present Current" for _, _, name in row.registers) else "xl430_w250"

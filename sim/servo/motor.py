@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from math import exp
 
 from sim.motion import PiecewiseMotion, dragged, rest, to_position, to_velocity
-from sim.servo.models import DEG_PER_COUNT, PWM_FULL, ServoModel
+from sim.servo.models import ServoModel
 from sim.servo.shaft import Shaft
 
 FRICTION_LOAD = 0.04  # friction of the gears while the shaft rotates, as a part of the stall torque
 PWM_PER_COUNT = 5.0
 """PWM of the position controller for each count of error: Position P Gain 640 / 128 (e-manual, XL430-W250)."""
-_ERROR_AT_STALL_DEG = PWM_FULL / PWM_PER_COUNT * DEG_PER_COUNT
+_ERROR_AT_STALL_DEG = 885 / PWM_PER_COUNT * 360 / 4096
 """Error at which the position controller pushes with the stall torque."""
 SUPPLY_DROP_V = 0.4  # voltage lost in the supply's cable at stall
 

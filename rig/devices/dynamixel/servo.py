@@ -1,6 +1,7 @@
-"""A Dynamixel servo: of the X series, of the MX series (2.0), or an AX-12A.
+"""A Dynamixel servo of any model whose row in `rig.config.servos` is complete.
 
-One class drives all of them. What differs is a row (`ServoSeries`), or follows from the registers that a model lacks.
+One class drives all of them: resolution, units and registers are those of the row. The names of some registers differ
+between the two protocols (`RegisterNames`).
 
 Decision: docs/decisions/0007.
 """
@@ -10,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 from rig.config import ServoConfig
+from rig.config.servos import DynamixelModel
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
 from rig.core.next_steps import Do
@@ -20,7 +22,6 @@ from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import (
     Block,
     ControlTable,
-    DynamixelModel,
     control_table,
     model_of,
     protocol_of,
@@ -35,11 +36,6 @@ BOOT_ALLOWANCE_S = 3.0
 TORQUE_OFF_ATTEMPTS = 3
 """Largest number of attempts to switch the torque off and read it back before it counts as on."""
 
-COUNTS_PER_REVOLUTION = 4096  # encoder of the X and MX series: 0.088° for each count
-DEG_PER_COUNT = 360.0 / COUNTS_PER_REVOLUTION
-DPS_PER_UNIT = 0.229 * 6.0  # Velocity registers: 0.229 rev/min
-# e-manual, Goal Position in extended position mode: 256 revolutions in each direction
-EXTENDED_RANGE_COUNTS = 1_048_575
 WATCHDOG_TRIPPED = 0xFF  # e-manual, Bus Watchdog: reads as −1; goals are read-only until 0 is written
 
 TICK_MODULUS_MS = 32768  # e-manual, Realtime Tick: wraps after 32,767 ms
@@ -50,7 +46,15 @@ TICK_MEMORY_S = 10.0  # the tick wraps after 33 s, and both clocks drift
 _FRESH_ATTEMPTS, _RESTARTED = 8, 3
 
 # e-manual, Hardware Error Status: by bit
-_HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
+_HARDWARE_ERRORS = {
+    0: "input voltage",
+    1: "motor hall sensor",
+    2: "overheating",
+    3: "motor encoder",
+    4: "electrical shock",
+    5: "overload",
+}
+_AX_SPEED_UNITS = 1023  # largest Moving Speed; the model has no Velocity Limit
 _AX_ARRIVED_COUNTS = 2  # largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise
 
 
@@ -61,21 +65,17 @@ def _by_direction_bit(value: int) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class ServoSeries:
-    """What differs between two series of servos: units at the servo's own shaft, and names of registers.
+class RegisterNames:
+    """The registers whose names differ between the protocols.
 
     ``state`` and ``condition`` are the first and the last register of the blocks that `DynamixelServo.read_state` and
-    `DynamixelServo.read_condition` read. ``volatile`` is a register that is 0 after power-up, and that the rig never
-    sets to 0. A servo without a register for the acceleration always has ``dps2_per_unit``.
+    `DynamixelServo.read_condition` read. ``reach`` are the limits within one revolution. ``volatile`` is a register
+    that is 0 after power-up, and that the rig never sets to 0.
     """
 
-    deg_per_count: float
-    dps_per_unit: float
-    dps2_per_unit: float
-    most_units: int
-    counts_revolutions: bool
     state: tuple[str, str]
     condition: tuple[str, str]
+    reach: tuple[str, str]
     velocity: str
     voltage: str
     profile_velocity: str
@@ -84,28 +84,20 @@ class ServoSeries:
     remarks: tuple[str, ...] = ()
 
 
-SERIES: Final = {
-    2: ServoSeries(
-        deg_per_count=DEG_PER_COUNT,
-        dps_per_unit=DPS_PER_UNIT,
-        dps2_per_unit=214.577 * 6.0 / 60.0,  # Profile Acceleration: 214.577 rev/min²
-        most_units=32767,
-        counts_revolutions=True,
+NAMES: Final = {
+    2: RegisterNames(
         state=("Realtime Tick", "Present Temperature"),
         condition=("Torque Enable", "Profile Acceleration"),
+        reach=("Min Position Limit", "Max Position Limit"),
         velocity="Present Velocity",
         voltage="Present Input Voltage",
         profile_velocity="Profile Velocity",
         volatile="Profile Acceleration",
     ),
-    1: ServoSeries(
-        deg_per_count=300.0 / 1023,
-        dps_per_unit=0.111 * 6.0,
-        dps2_per_unit=2000.0,  # its fastest acceleration, estimated from its 354 °/s, because no document states it
-        most_units=1023,
-        counts_revolutions=False,
+    1: RegisterNames(
         state=("Torque Enable", "Moving"),
         condition=("Torque Enable", "Moving"),
+        reach=("CW Angle Limit", "CCW Angle Limit"),
         velocity="Present Speed",
         voltage="Present Voltage",
         profile_velocity="Moving Speed",
@@ -117,7 +109,7 @@ SERIES: Final = {
         ),
     ),
 }
-"""The rows, by protocol."""
+"""The names, by protocol."""
 
 
 class DynamixelServo:
@@ -151,8 +143,9 @@ class DynamixelServo:
         guardian: Guardian | None = None,
     ) -> None:
         self.bus = bus
-        self._series = SERIES[bus.protocol]
-        if mode == "turntable" and not self._series.counts_revolutions:
+        self._names = NAMES[bus.protocol]
+        row = self._row = control_table(model).row
+        if mode == "turntable" and not row.multi_turn_counts:
             raise ConfigError(
                 "An AX-12A cannot be a turntable: it measures only 300° and does not count revolutions.",
                 next_step='In [table] set mode = "pan", zero_deg = 150 and limits_deg = [-150, 150] (its 300°), '
@@ -162,11 +155,12 @@ class DynamixelServo:
         self._id = bus_id
         self._mode = mode
         self._guardian = guardian
-        self.resolution_deg = self._series.deg_per_count / gear_ratio
+        self.resolution_deg = row.deg_per_count / gear_ratio
         self.revolution_deg = 360.0 / gear_ratio
-        self._dps_per_unit = self._series.dps_per_unit / gear_ratio
-        self._dps2_per_unit = self._series.dps2_per_unit / gear_ratio
-        self.remarks = self._series.remarks
+        self._dps_per_unit = row.dps_per_unit / gear_ratio
+        self._dps2_per_unit = row.dps2_per_unit / gear_ratio
+        self.remarks = self._names.remarks
+        self._kept: dict[str, int] = {}  # the permanent settings
         self._blocks: dict[tuple[str, str], Block] = {}
         self._tick: tuple[int, int] | None = None  # time and Realtime Tick of the last fresh reading
         self._unconfirmed: list[tuple[int, int]] = []  # readings that agree with each other, but not with it
@@ -178,12 +172,12 @@ class DynamixelServo:
             raise DeviceNotFound(
                 f"No servo answers at id {bus_id}.",
                 next_step="Check the servo's power and cable, and servo.id, servo.baud and servo.model in the "
-                "configuration. An AX-12A uses another protocol than the other models.",
+                "configuration. An AX-12A uses another protocol than the other models, and so do an MX-28, MX-64 or "
+                "MX-106 with the factory's firmware: `rig find` finds them.",
                 evidence=silent.evidence,
             ) from silent
-        found = model_of(number)
-        if found != model:
-            require_driven(number, bus_id)
+        require_driven(number, bus_id)
+        if (found := model_of(number)) != model:
             raise DeviceMismatch(
                 f"The servo at id {bus_id} is not the configured model.",
                 next_step=(
@@ -201,8 +195,11 @@ class DynamixelServo:
         self._table: ControlTable = control_table(model, firmware)
         self.identity = ServoIdentity(model, number, bus_id, firmware)
         self.limits = ServoLimits(
-            temperature_c=float(self._read("Temperature Limit")),
-            voltage_v=(self._read("Min Voltage Limit") * 0.1, self._read("Max Voltage Limit") * 0.1),
+            temperature_c=self._read("Temperature Limit") * row.c_per_unit,
+            voltage_v=(
+                self._read("Min Voltage Limit") * row.v_per_unit,
+                self._read("Max Voltage Limit") * row.v_per_unit,
+            ),
         )
         # Present Current and Current Limit have the same unit, so their ratio is independent of the model.
         self._current_limit = self._read("Current Limit") if "Present Current" in self._table else None
@@ -210,12 +207,10 @@ class DynamixelServo:
     @property
     def reach_deg(self) -> tuple[float, float]:
         if self._mode == "turntable":
-            low, high = -EXTENDED_RANGE_COUNTS, EXTENDED_RANGE_COUNTS
-        elif "CW Angle Limit" in self._table:
-            low, high = self._read("CW Angle Limit"), self._read("CCW Angle Limit")
-        else:
-            low, high = 0, COUNTS_PER_REVOLUTION - 1
-        return low * self.resolution_deg, high * self.resolution_deg
+            high_deg = self._row.multi_turn_counts * self.resolution_deg
+            return -high_deg, high_deg
+        low, high = (self._kept_settings()[name] * self.resolution_deg for name in self._names.reach)
+        return low, high
 
     @property
     def bus_statistics(self) -> dict[str, int]:
@@ -234,17 +229,24 @@ class DynamixelServo:
                 evidence={d.register: f"found {d.found}, wanted {d.wanted}: {d.reason}" for d in differences},
             )
         settings.write(self.bus, self._id, self._table, differences)
+        self._kept |= {d.register: d.wanted for d in differences}
         return tuple(f"servo: {d.register} was {d.found}, is now {d.wanted}" for d in differences)
 
     def setting_differences(self) -> list[SettingDifference]:
         """Return the EEPROM settings that differ from what the rig needs."""
-        return settings.compare(self.bus, self._id, self._table, self._mode)
+        self._kept = settings.read(self.bus, self._id, self._table)
+        return settings.differing(self._kept, self._mode)
+
+    def _kept_settings(self) -> dict[str, int]:
+        """Return the permanent settings as last read by `setting_differences`."""
+        self._kept = self._kept or settings.read(self.bus, self._id, self._table)
+        return self._kept
 
     # -- readings -----------------------------------------------------------------------------------------------------
 
     def read_state(self) -> ServoState:
-        series = self._series
-        time_ns, values = self._read_fresh() if "Realtime Tick" in self._table else self._read_block(*series.state)
+        names, row = self._names, self._row
+        time_ns, values = self._read_fresh() if "Realtime Tick" in self._table else self._read_block(*names.state)
         position, trajectory = values["Present Position"], values.get("Position Trajectory")
         moving = bool(values["Moving"])
         # A model without Moving Status, trajectory or current has other registers for the same.
@@ -256,15 +258,15 @@ class DynamixelServo:
         if self._current_limit is not None:
             load_percent = 100.0 * values["Present Current"] / self._current_limit
         else:
-            load_percent = 0.1 * series.signed(values["Present Load"])
+            load_percent = row.load_percent_per_unit * names.signed(values["Present Load"])
         return ServoState(
             time_ns=time_ns,
             sampled_ns=self.bus.sampled_ns,
             position_deg=position * self.resolution_deg,
-            velocity_dps=series.signed(values[series.velocity]) * self._dps_per_unit,
+            velocity_dps=names.signed(values[names.velocity]) * self._dps_per_unit,
             load_percent=load_percent,
-            voltage_v=values[series.voltage] * 0.1,
-            temperature_c=float(values["Present Temperature"]),
+            voltage_v=values[names.voltage] * row.v_per_unit,
+            temperature_c=values["Present Temperature"] * row.c_per_unit,
             moving=moving,
             in_position=in_position,
             hardware_errors=self._hardware_errors() if self.bus.alert(self._id) else (),
@@ -272,7 +274,7 @@ class DynamixelServo:
         )
 
     def read_condition(self) -> ServoCondition:
-        _, values = self._read_block(*self._series.condition)
+        _, values = self._read_block(*self._names.condition)
         watchdog = values.get("Bus Watchdog", 0)
         tripped = watchdog == WATCHDOG_TRIPPED
         return ServoCondition(
@@ -280,7 +282,7 @@ class DynamixelServo:
             watchdog_armed=0 < watchdog < WATCHDOG_TRIPPED,
             watchdog_tripped=tripped,
             # The rig's profile is never 0. The register is 0 after power-up, and after the watchdog has tripped.
-            power_lost=not tripped and values[self._series.volatile] == 0,
+            power_lost=not tripped and values[self._names.volatile] == 0,
             hardware_errors=hardware_errors(values.get("Hardware Error Status", self.bus.alert(self._id))),
         )
 
@@ -314,12 +316,15 @@ class DynamixelServo:
     # -- motion -------------------------------------------------------------------------------------------------------
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
-        velocity = min(max(round(profile.velocity_dps / self._dps_per_unit), 1), self._series.most_units)  # 0: no limit
+        limits = self._kept_settings()
+        velocity = round(profile.velocity_dps / self._dps_per_unit)
+        velocity = max(min(velocity, limits.get("Velocity Limit", _AX_SPEED_UNITS)), 1)  # 0: no limit
         acceleration = 1
         if "Profile Acceleration" in self._table:
-            acceleration = max(round(profile.acceleration_dps2 / self._dps2_per_unit), 1)
+            acceleration = round(profile.acceleration_dps2 / self._dps2_per_unit)
+            acceleration = max(min(acceleration, limits.get("Acceleration Limit", acceleration)), 1)
             self._write("Profile Acceleration", acceleration)
-        self._write(self._series.profile_velocity, velocity)
+        self._write(self._names.profile_velocity, velocity)
         return MotionProfile(velocity * self._dps_per_unit, acceleration * self._dps2_per_unit)
 
     def torque_on(self) -> None:
@@ -399,7 +404,7 @@ class DynamixelServo:
     def _read_fresh(self) -> tuple[int, dict[str, int]]:
         """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""
         for _ in range(_FRESH_ATTEMPTS):
-            time_ns, values = self._read_block(*self._series.state, dated=True)
+            time_ns, values = self._read_block(*self._names.state, dated=True)
             if self._is_fresh((time_ns, values["Realtime Tick"])):
                 return time_ns, values
         raise DeviceFault(

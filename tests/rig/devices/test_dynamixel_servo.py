@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
 from rig.core.next_steps import Do
 from rig.devices.dynamixel.registers import control_table, model_numbers
-from rig.devices.dynamixel.servo import DEG_PER_COUNT, DynamixelServo
+from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.servo import MotionProfile
 from sim.noise import NoiseModel
 from tests.fuzzing import examples
@@ -63,7 +63,7 @@ def test_goal_is_reached_within_one_count_over_many_revolutions(goal_deg):
     servo.move_to(start + goal_deg)
     wires.world.clock.sleep(6.0)
     state = servo.read_state()
-    assert state.position_deg == pytest.approx(start + goal_deg, abs=DEG_PER_COUNT)
+    assert state.position_deg == pytest.approx(start + goal_deg, abs=360 / 4096)
     assert state.in_position
     assert not state.moving
 

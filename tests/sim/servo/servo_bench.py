@@ -12,6 +12,9 @@ from sim.servo import Sender, SentBytes, ServoBus, SimSerial, XSeriesServo
 from sim.world import World
 
 ALERT = 0x80
+DEG_PER_COUNT = 360 / 4096  # e-manual, X series
+DPS_PER_UNIT = 0.229 * 6  # 0.229 rev/min
+DPS2_PER_UNIT = 214.577 * 6 / 60  # 214.577 rev/min²
 
 
 @dataclass

@@ -16,11 +16,11 @@ from sim.servo.base import (
     SUPERVISION_S,
     VOLTAGE_ERROR,
 )
-from sim.servo.models import DEG_PER_COUNT, MODELS
+from sim.servo.models import MODELS
 from sim.servo.motor import OVERLOAD_S, PWM_PER_COUNT
 from sim.servo.protocol2 import StatusError
 from tests.fuzzing import examples
-from tests.sim.servo.servo_bench import ALERT, Line, extended
+from tests.sim.servo.servo_bench import ALERT, DEG_PER_COUNT, Line, extended
 
 FOLLOWING_ERROR = 0x08
 
@@ -265,6 +265,6 @@ def test_short_power_cuts_cause_one_boot(line: Line) -> None:
     [({"bus_id": 253}, "253"), ({"baudrate": 56_000}, "56000"), ({"model": "xl999"}, r"xl999.*xl430_w250")],
 )
 def test_invalid_servos_are_rejected(option: dict[str, Any], message: str) -> None:
-    assert set(MODELS) == {"xl430_w250", "xm430_w350", "xl330_m288", "mx_28"}
+    assert set(MODELS) == {"xl430_w250", "xm430_w350", "xl330_m288", "mx_28", "ph54_200_s500"}
     with pytest.raises(ValueError, match=message):
         Line().add(**option)

@@ -49,7 +49,8 @@ def test_bytes_on_the_wire_equal_the_emanuals_and_the_sdks(line: Line) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "number"), [("xl430_w250", 1060), ("xm430_w350", 1020), ("xl330_m288", 1200), ("mx_28", 30)]
+    ("model", "number"),
+    [("xl430_w250", 1060), ("xm430_w350", 1020), ("xl330_m288", 1200), ("mx_28", 30), ("ph54_200_s500", 2020)],
 )
 def test_every_model_answers_with_its_number_and_initial_values(model: str, number: int) -> None:
     line = Line()

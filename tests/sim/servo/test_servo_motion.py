@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.noise import NoiseModel
-from sim.servo.models import DEG_PER_COUNT, DPS2_PER_UNIT, DPS_PER_UNIT, MODELS
+from sim.servo.models import MODELS
 from sim.servo.motor import FRICTION_LOAD
 from tests.fuzzing import examples
-from tests.sim.servo.servo_bench import Line, extended
+from tests.sim.servo.servo_bench import DEG_PER_COUNT, DPS2_PER_UNIT, DPS_PER_UNIT, Line, extended
 
 XL430 = MODELS["xl430_w250"]
 IN_POSITION, ONGOING, FOLLOWING_ERROR = 0x01, 0x02, 0x08

@@ -162,10 +162,10 @@ def test_operator_chooses_one_of_several_servos(parts, home):
 
 def test_servo_that_the_rig_cannot_drive_is_neither_configured_nor_changed(parts, home):
     memory = parts.devices.servo.memory
-    memory["Model Number"] = 2010
+    memory["Model Number"] = 4000
     done = rig("setup", "--yes")
     assert done.exit_code == 4
-    assert "PH54-100-S500, firmware 46, id 1 at 57600 baud (protocol 2.0): the rig cannot drive it" in done.stdout
+    assert "YM070-210-M001, firmware 46, id 1 at 57600 baud (protocol 2.0): the rig cannot drive it" in done.stdout
     assert load_config(home / "rig.toml").servo.model_fields_set <= {"port"}
     assert rig("servo", "settings", "--write", "--yes").exit_code == 4
     assert (memory["Operating Mode"], memory["Return Delay Time"]) == (3, 250)
