@@ -53,8 +53,9 @@ class DynamixelModel:
     """A row of the table; angles and rates are those of the servo's own shaft, and 0 is an unknown unit.
 
     ``name`` is the value of ``servo.model``, ``number`` its Model Number. ``registers`` are address, size and e-manual
-    name of each register. ``zero_counts`` is the middle of a revolution. ``multi_turn_counts`` is the largest goal in
-    each direction in extended position mode, 0 if the model counts no revolutions. ``dps2_per_unit`` is the unit of
+    name of each register. ``zero_counts`` is the middle of a revolution. ``extended_counts`` is the largest goal in
+    each direction in extended position mode, 0 if the model counts no revolutions. ``most_units`` limits a speed or an
+    acceleration for which the model has no register with a limit. ``dps2_per_unit`` is the unit of
     Profile Acceleration; a model without this register always accelerates at this rate.
     """
 
@@ -64,7 +65,8 @@ class DynamixelModel:
     registers: tuple[tuple[int, int, str], ...]
     deg_per_count: float = 0.0
     zero_counts: int = 0
-    multi_turn_counts: int = 0
+    extended_counts: int = 0
+    most_units: int = 0
     dps_per_unit: float = 0.0
     dps2_per_unit: float = 0.0
     ma_per_unit: float = 0.0
@@ -97,7 +99,8 @@ class DynamixelModel:
 
 _X: Final[dict[str, Any]] = {
     "dps2_per_unit": 214.577 * 6.0 / 60.0,  # 214.577 rev/min²
-    "multi_turn_counts": 1_048_575,
+    "extended_counts": 1_048_575,
+    "most_units": 32_767,
     "pwm_percent_per_unit": 0.113,
 }
 # e-manual, Profile Acceleration, Goal Position, Current Limit and PWM Limit of each series; by beginnings of the names.
@@ -107,7 +110,7 @@ _SERIES: Final[dict[tuple[str, ...], dict[str, Any]]] = {
     ("x", "2x"): _X | {"ma_per_unit": 2.69},
     ("ph", "pm", "h42", "h54", "m42", "m54"): {
         "dps2_per_unit": 6.0 / 60.0,  # 1 rev/min²
-        "multi_turn_counts": 2**31 - 1,
+        "extended_counts": 2**31 - 1,
         "ma_per_unit": 1.0,
         "pwm_percent_per_unit": 0.0498,
     },
@@ -153,6 +156,7 @@ AX_12A = DynamixelModel(  # e-manual, AX-12A; the SDK has no file of it. No valu
     ),
     deg_per_count=300.0 / 1023,
     zero_counts=512,
+    most_units=1023,
     dps_per_unit=0.111 * 6.0,
     dps2_per_unit=2000.0,  # its fastest acceleration, estimated from its 354 °/s, because no document states it
 )
@@ -213,7 +217,8 @@ def driven(model: str) -> str:
     points = [point.name for point in entry_points(group=GROUP)]  # only now, because looking them up takes 10 ms
     if model not in points:
         known = [row.name for name in model_numbers().values() if (row := known_model(name)) and not row.missing()]
-        near = difflib.get_close_matches(model.lower().replace("-", "_"), [*known, *points], n=1)
+        name = model.lower().replace("-", "_")  # as on a label, where more may follow: PH54-200-S500-R
+        near = [one for one in known if name.startswith(one)] or difflib.get_close_matches(name, [*known, *points], n=1)
         raise ValueError("unknown model" + (f"; did you mean {near[0]}?" if near else "; `rig find` names yours"))
     return model
 

@@ -30,8 +30,8 @@ class Memory:
     """Control table of a servo; values by register name, signed if the register is.
 
     A byte of Indirect Data is the byte at its Indirect Address. Addresses below `ram_start` are EEPROM: kept without
-    power, locked while torque is on. From `live_start` (Realtime Tick) on, registers follow the world. `turn` are the
-    positions within one revolution.
+    power, locked while torque is on. From `live_start` (Realtime Tick) on, registers follow the world. `one_revolution`
+    are the positions within one revolution.
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
@@ -39,8 +39,12 @@ class Memory:
         row = self.row = table.row
         self.ram_start, self.live_start = table.ram_start, table["Realtime Tick"].address
         lowest = row.zero_counts - row.counts_per_revolution // 2
-        self.turn = range(lowest, lowest + row.counts_per_revolution)
-        self._ranges = {**model.ranges, "Min Position Limit": self.turn, "Max Position Limit": self.turn}
+        self.one_revolution = range(lowest, lowest + row.counts_per_revolution)
+        self._ranges = {
+            **model.ranges,
+            "Min Position Limit": self.one_revolution,
+            "Max Position Limit": self.one_revolution,
+        }
         self._registers = {register.name: register for register in _plain(table)}
         self._indirect: dict[int, Register] = {}
         for first, data, count in _indirect_blocks(table):
@@ -56,7 +60,7 @@ class Memory:
         last = self._registers["Present Temperature"]
         self._live_end = last.address + last.size
         identity = {"Firmware Version": firmware, "Model Number": row.number}
-        limits = {"Min Position Limit": self.turn[0], "Max Position Limit": self.turn[-1]}
+        limits = {"Min Position Limit": self.one_revolution[0], "Max Position Limit": self.one_revolution[-1]}
         self._defaults = {**limits, **model.initial, **identity}
         for address, pointer in self._indirect.items():
             self._defaults[pointer.name] = address

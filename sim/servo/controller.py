@@ -128,8 +128,9 @@ class Controller:
     def wrap_position(self) -> None:
         """Reset the count of revolutions: the position continues from within one revolution."""
         self._revolution_counts = 0
-        turn = self._memory.turn
-        self._revolution_counts = (self._present_position() - self._homing - turn.start) // len(turn) * len(turn)
+        positions = self._memory.one_revolution
+        present = self._present_position() - self._homing - positions.start
+        self._revolution_counts = present - present % len(positions)
         self._memory["Goal Position"] = self._present_position()
 
     def slip_encoder(self, angle_deg: float) -> None:

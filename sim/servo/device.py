@@ -186,7 +186,7 @@ class XSeriesServo(SimulatedServoBase):
             case "Goal Position" if memory["Operating Mode"] == POSITION_MODE:
                 return memory["Min Position Limit"], memory["Max Position Limit"]
             case "Goal Position":
-                return -memory.row.multi_turn_counts, memory.row.multi_turn_counts
+                return -memory.row.extended_counts, memory.row.extended_counts
             case "Goal Velocity" | "Goal PWM" | "Goal Current":
                 limit = memory[name.removeprefix("Goal ") + " Limit"]
                 return -limit, limit

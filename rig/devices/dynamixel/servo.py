@@ -54,7 +54,6 @@ _HARDWARE_ERRORS = {
     4: "electrical shock",
     5: "overload",
 }
-_AX_SPEED_UNITS = 1023  # largest Moving Speed; the model has no Velocity Limit
 _AX_ARRIVED_COUNTS = 2  # largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise
 
 
@@ -145,7 +144,7 @@ class DynamixelServo:
         self.bus = bus
         self._names = NAMES[bus.protocol]
         row = self._row = control_table(model).row
-        if mode == "turntable" and not row.multi_turn_counts:
+        if mode == "turntable" and not row.extended_counts:
             raise ConfigError(
                 "An AX-12A cannot be a turntable: it measures only 300° and does not count revolutions.",
                 next_step='In [table] set mode = "pan", zero_deg = 150 and limits_deg = [-150, 150] (its 300°), '
@@ -171,9 +170,12 @@ class DynamixelServo:
         except DeviceSilent as silent:
             raise DeviceNotFound(
                 f"No servo answers at id {bus_id}.",
-                next_step="Check the servo's power and cable, and servo.id, servo.baud and servo.model in the "
-                "configuration. An AX-12A uses another protocol than the other models, and so do an MX-28, MX-64 or "
-                "MX-106 with the factory's firmware: `rig find` finds them.",
+                next_step=(
+                    "Check the servo's power and cable, and servo.id, servo.baud and servo.model in the configuration. "
+                    "An AX-12A uses another protocol than the other models, and so does an MX-28, MX-64 or MX-106 "
+                    "with the firmware of the factory.",
+                    Do.FIND(),
+                ),
                 evidence=silent.evidence,
             ) from silent
         require_driven(number, bus_id)
@@ -207,7 +209,7 @@ class DynamixelServo:
     @property
     def reach_deg(self) -> tuple[float, float]:
         if self._mode == "turntable":
-            high_deg = self._row.multi_turn_counts * self.resolution_deg
+            high_deg = self._row.extended_counts * self.resolution_deg
             return -high_deg, high_deg
         low, high = (self._kept_settings()[name] * self.resolution_deg for name in self._names.reach)
         return low, high
@@ -316,13 +318,13 @@ class DynamixelServo:
     # -- motion -------------------------------------------------------------------------------------------------------
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
-        limits = self._kept_settings()
-        velocity = round(profile.velocity_dps / self._dps_per_unit)
-        velocity = max(min(velocity, limits.get("Velocity Limit", _AX_SPEED_UNITS)), 1)  # 0: no limit
+        limits, most = self._kept_settings(), self._row.most_units
+        velocity = min(round(profile.velocity_dps / self._dps_per_unit), limits.get("Velocity Limit", most))
+        velocity = max(velocity, 1)  # 0: no limit
         acceleration = 1
         if "Profile Acceleration" in self._table:
             acceleration = round(profile.acceleration_dps2 / self._dps2_per_unit)
-            acceleration = max(min(acceleration, limits.get("Acceleration Limit", acceleration)), 1)
+            acceleration = max(min(acceleration, limits.get("Acceleration Limit", most)), 1)
             self._write("Profile Acceleration", acceleration)
         self._write(self._names.profile_velocity, velocity)
         return MotionProfile(velocity * self._dps_per_unit, acceleration * self._dps2_per_unit)

@@ -1,122 +1,199 @@
-"""The models of the SDK: the rig accepts those that its driver drives rightly, and rejects the others by name.
+"""Every model of the SDK: it is moved by its own counts and units on the simulated wire, or rejected by its name.
 
-The `.model` files of the SDK are read here once more, and compared with what the driver does.
+The `.model` files are read here once more. Resolution and units are the e-manual's, written here a second time.
 """
 
+from dataclasses import dataclass
 from importlib.resources import files
-from math import degrees
 
 import pytest
 
 from rig.config import load_config
+from rig.config.servos import FACTORY_PROTOCOL_1, USE_ANOTHER, DynamixelModel, known_model
 from rig.core.errors import ConfigError, DeviceMismatch
-from rig.devices.dynamixel.registers import control_table
-from rig.devices.dynamixel.servo import DEG_PER_COUNT, DPS_PER_UNIT, DynamixelServo
+from rig.devices.dynamixel.registers import control_table, model_numbers
+from rig.devices.dynamixel.servo import DynamixelServo, open_servo
+from rig.devices.servo import MotionProfile
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.finding import FindingCode
+from sim.devices import SimDevices
+from sim.noise import NoiseModel
+from sim.world import World
 from tests.rig.bench_parts import open_bus, servo_wires
 from tests.rig.doctor.doctor_parts import unopened
 
 FOLDER = files("dynamixel_easy_sdk") / "control_table"
+FILES = sorted(path.name.removesuffix(".model") for path in FOLDER.iterdir() if path.name.endswith(".model"))
 NUMBERS = {
     name.removesuffix(".model"): int(number)
     for number, name in (line.split() for line in (FOLDER / "dynamixel.model").read_text().splitlines()[1:])
 }
-REJECTED = {name for name in NUMBERS if name == "xl320" or not name.startswith(("x", "2x", "mx"))}
-# Address and size of the registers that the driver uses, from the e-manual of the XL430-W250.
-REGISTERS = {
-    "Model Number": (0, 2),
-    "Firmware Version": (6, 1),
-    "ID": (7, 1),
-    "Baud Rate": (8, 1),
-    "Return Delay Time": (9, 1),
-    "Drive Mode": (10, 1),
-    "Operating Mode": (11, 1),
-    "Homing Offset": (20, 4),
-    "Temperature Limit": (31, 1),
-    "Max Voltage Limit": (32, 2),
-    "Min Voltage Limit": (34, 2),
-    "Velocity Limit": (44, 4),
-    "Shutdown": (63, 1),
-    "Torque Enable": (64, 1),
-    "Status Return Level": (68, 1),
-    "Hardware Error Status": (70, 1),
-    "Goal Velocity": (104, 4),
-    "Profile Acceleration": (108, 4),
-    "Profile Velocity": (112, 4),
-    "Goal Position": (116, 4),
-    "Realtime Tick": (120, 2),
-    "Moving": (122, 1),
-    "Moving Status": (123, 1),
-    "Present Velocity": (128, 4),
-    "Present Position": (132, 4),
-    "Position Trajectory": (140, 4),
-    "Present Input Voltage": (144, 2),
-    "Present Temperature": (146, 1),
+REJECTED = {name for name in NUMBERS if name.startswith("ym") or name in ("xl320", "rh_p12_rn")}
+WRITE = 0x03
+
+
+@dataclass(frozen=True)
+class Series:
+    """What the e-manual says about a series: counts, rev/min and rev/min² for each unit, the largest goal."""
+
+    counts: int
+    rpm: float
+    rpm2: float
+    extended: int
+
+
+X = Series(4096, 0.229, 214.577, 1_048_575)
+SERIES = {
+    **dict.fromkeys(("x", "2x", "mx"), X),
+    **dict.fromkeys(("ph54", "h54"), Series(1_003_846, 0.01, 1.0, 2**31 - 1)),
+    **dict.fromkeys(("ph42", "h42"), Series(607_500, 0.01, 1.0, 2**31 - 1)),
+    **dict.fromkeys(("pm54", "m54"), Series(502_834, 0.01, 1.0, 2**31 - 1)),
+    **dict.fromkeys(("pm42", "m42"), Series(526_374, 0.01, 1.0, 2**31 - 1)),
 }
-OTHER_NAMES = {"Secondary ID": (12, 1), "Bus Watchdog": (98, 1)}  # the files write these names differently
-FIRMWARE = (45, 52)
 
 
-def model_file(file: str) -> dict[str, dict[str, str]]:
-    """Return the sections of a `.model` file: the last value of each row by its name, for registers the place."""
-    sections: dict[str, dict[str, str]] = {}
-    for line in (FOLDER / file).read_text().splitlines():
-        row = line.split("\t")
-        if line.startswith("["):
-            here = sections.setdefault(line.strip("[]"), {})
-        elif line and row[0] not in {"name", "Data Name", "Address"}:
-            here.update({row[2]: f"{row[0]} {row[1]}"} if row[0].isdigit() else {row[0]: row[1]})
-    return sections
+def places(file: str) -> dict[str, tuple[int, int]]:
+    """Return address and size of each register in a `.model` file."""
+    rows = (FOLDER / f"{file}.model").read_text().partition("[control table]")[2].splitlines()
+    cells = [row.split("\t") for row in rows if row[:1].isdigit()]
+    return {name.replace("BUS", "Bus"): (int(address), int(size)) for address, size, name in cells}
 
 
-def drives_rightly(model: str) -> bool:
-    """Return whether the driver's 90° are 90° of this model, its speeds are the driver's, and so are its registers."""
-    for file in (f"{model}.model", f"{model}_fw52.model"):
-        if not (FOLDER / file).is_file():
-            continue
-        found = model_file(file)
-        kind = {name: float(value) for name, value in found["type info"].items()}
-        deg_per_count = degrees(kind["max_radian"] - kind["min_radian"]) / (
-            kind["value_of_max_radian_position"] - kind["value_of_min_radian_position"]
-        )
-        dps_per_unit = degrees(float(found["unit info"]["Goal Velocity"]))
-        places = found["control table"]
-        rotated_deg = round(90 / DEG_PER_COUNT) * deg_per_count
-        load = places.get("Present Load") or (places.get("Present Current") if "Current Limit" in places else None)
-        if not (
-            rotated_deg == pytest.approx(90, abs=0.1)
-            and dps_per_unit == pytest.approx(DPS_PER_UNIT, rel=1e-3)
-            and load == "126 2"
-            and all(places.get(name) == f"{at} {size}" for name, (at, size) in REGISTERS.items())
-        ):
-            return False
-    return True
+def driven_on_a_wire(file: str):
+    """Return simulated wires and the driver of the servo of a `.model` file, with the settings that it needs."""
+    model, new, _ = file.partition("_fw52")
+    wires = servo_wires(NoiseModel.none(), model=model, firmware=52 if new else 44)
+    servo = DynamixelServo(open_bus(wires), bus_id=1, model=model, clock=wires.world.clock)
+    servo.prepare(write=True)
+    return wires, servo
 
 
-def test_all_models_of_the_sdk_are_in_the_list():
-    assert len(NUMBERS) == 60  # and the AX-12A, which has no file
-    assert len(REJECTED) == 26
+def written(wires, place: tuple[int, int]) -> list[int]:
+    """Return the values that the host has written to a place of the servo's memory."""
+    address, size = place
+    sent = [frame[8:-2] for frame in wires.instructions if frame[7] == WRITE]
+    return [
+        int.from_bytes(data[2:], "little", signed=True)
+        for data in sent
+        if data[:2] == address.to_bytes(2, "little") and len(data) == 2 + size
+    ]
 
 
-@pytest.mark.parametrize("model", [*NUMBERS, "ax_12a"])
-def test_model_is_accepted_only_if_it_is_driven_rightly(model):
-    if model == "ax_12a" or model not in REJECTED:
-        assert model == "ax_12a" or drives_rightly(model)
-        assert load_config(None, [f"servo.model={model}"]).servo.model == model
-        for firmware in FIRMWARE if model != "ax_12a" else ():
-            table = control_table(model, firmware)
-            used = REGISTERS | OTHER_NAMES
-            assert {name: (table[name].address, table[name].size) for name in used} == used
-        return
-    assert not drives_rightly(model)
+def test_every_file_of_the_sdk_belongs_to_a_model():
+    assert len(NUMBERS) == 60
+    assert len(REJECTED) == 14
+    listed = {name.partition("_fw52")[0] for name in FILES} - {"dynamixel"}
+    assert listed == set(model_numbers().values()) - {"ax_12a"}  # which has no file
+    assert {name: number for number, name in model_numbers().items() if name in NUMBERS} == NUMBERS
+
+
+@pytest.mark.parametrize("file", [name for name in FILES if name != "dynamixel" and name not in REJECTED])
+def test_servo_moves_by_the_counts_and_units_of_its_model(file):
+    model, place = file.partition("_fw52")[0], places(file)
+    series = next(row for start, row in SERIES.items() if model.startswith(start))
+    assert load_config(None, [f"servo.model={model}"]).servo.model == model
+    wires, servo = driven_on_a_wire(file)
+
+    # Each register is where the file says.
+    table = control_table(model, 52 if file.endswith("_fw52") else 44)
+    assert {name: (r.address, r.size) for name, r in table.items() if name in place} == {
+        name: at for name, at in place.items() if name in table
+    }
+
+    # A move by 90°.
+    start, shaft_deg = servo.read_state(), wires.world.shaft()[0]
+    profile = servo.set_profile(MotionProfile(60.0, 300.0))
+    servo.torque_on()
+    servo.move_to(start.position_deg + 90.0)
+    units = round(60.0 / (series.rpm * 6)), round(300.0 / (series.rpm2 * 360 / 3600))
+    assert (written(wires, place["Profile Velocity"]), written(wires, place["Profile Acceleration"])) == (
+        [units[0]],
+        [units[1]],
+    )
+    assert profile.velocity_dps == pytest.approx(units[0] * series.rpm * 6)
+    assert profile.acceleration_dps2 == pytest.approx(units[1] * series.rpm2 / 10)
+    first, *_, goal = written(wires, place["Goal Position"])
+    assert goal - first == round(series.counts / 4)
+    wires.world.clock.sleep(1.0)
+    assert servo.read_state().velocity_dps == pytest.approx(profile.velocity_dps, abs=series.rpm * 6)
+    wires.world.clock.sleep(3.0)
+    end = servo.read_state()
+    one = 360 / series.counts
+    assert servo.resolution_deg == pytest.approx(one)
+    assert end.position_deg - start.position_deg == pytest.approx(90.0, abs=one)
+    assert wires.world.shaft()[0] - shaft_deg == pytest.approx(90.0, abs=one)
+    assert end.in_position
+    assert not end.moving
+    assert servo.reach_deg == pytest.approx((-series.extended * one, series.extended * one))
+
+
+@pytest.mark.parametrize("file", [name for name in FILES if name != "dynamixel" and name not in REJECTED])
+def test_limits_of_the_servo_are_respected_and_read_in_its_units(file):
+    place = places(file)
+    wires, servo = driven_on_a_wire(file)
+    memory = wires.device.memory
+    for limit in ("Velocity Limit", "Acceleration Limit"):
+        if limit in place:
+            memory[limit] //= 2
+    servo.prepare(write=False)
+    servo.set_profile(MotionProfile(1e6, 1e9))
+    assert written(wires, place["Profile Velocity"]) == [memory["Velocity Limit"]]
+    most = memory["Acceleration Limit"] if "Acceleration Limit" in place else 32_767  # e-manual, X series
+    (acceleration,) = written(wires, place["Profile Acceleration"])
+    assert acceleration == most
+    memory["Temperature Limit"], memory["Min Voltage Limit"], memory["Max Voltage Limit"] = 61, 70, 130
+    again = DynamixelServo(servo.bus, bus_id=1, model=servo.identity.model, clock=wires.world.clock, mode="pan")
+    assert again.limits.temperature_c == 61.0
+    assert again.limits.voltage_v == pytest.approx((7.0, 13.0))
+    memory["Min Position Limit"], memory["Max Position Limit"] = 100, 1000
+    assert again.reach_deg == pytest.approx((100 * servo.resolution_deg, 1000 * servo.resolution_deg))
+
+
+def test_ax12_pans_by_its_own_counts_and_units():
+    chosen = load_config(None, ["servo.model=ax_12a", "servo.baud=1000000", "table.mode=pan"])
+    world = World(noise=NoiseModel.none())
+    with SimDevices.connected(chosen, world) as devices:
+        frames: list[bytes] = []
+        devices.servo_bus.taps.append(lambda frame: frames.append(frame.data))
+        servo = open_servo(devices.adapter, chosen.servo, world.clock, "pan")
+        servo.prepare(write=True)
+        start_deg = servo.read_state().position_deg
+        servo.set_profile(MotionProfile(60.0, 300.0))
+        servo.torque_on()
+        servo.move_to(start_deg + 90.0)
+        # e-manual, AX-12A: Goal Position at 30 with 1023 counts for 300°, Moving Speed at 32 with 0.111 rev/min
+        words = {data[5]: int.from_bytes(data[6:8], "little") for data in frames if data[4:5] == b"\x03"}
+        assert words[30] == 512 + round(90 * 1023 / 300)
+        assert words[32] == round(60 / (0.111 * 6))
+        world.clock.sleep(4.0)
+        assert servo.read_state().position_deg - start_deg == pytest.approx(90.0, abs=300 / 1023)
+        assert world.shaft()[0] == pytest.approx(90.0, abs=300 / 1023)
+
+
+@pytest.mark.parametrize("model", sorted(REJECTED))
+def test_model_without_a_complete_row_is_rejected_by_its_name(model):
+    missing = known_model(model).missing()
+    assert missing
+    assert not set(missing) & set(places(model))
     with pytest.raises(ConfigError) as caught:
         load_config(None, [f"servo.model={model}"])
     (mistake,) = caught.value.evidence["mistakes"]
-    assert "servo.model: the rig cannot drive this model" in mistake
-    assert f"Use a servo of the X series or the MX series (2.0), or an AX-12A (found '{model}')" in mistake
-    with pytest.raises(ConfigError, match=f"cannot drive a {model}"):  # the second lock: no register has an address
+    assert f"servo.model: the rig cannot drive this model: its row in the table of models lacks {missing[0]}" in mistake
+    assert f"{USE_ANOTHER} (found '{model}')" in mistake
+    with pytest.raises(ConfigError, match=f"cannot drive a {model}") as caught:  # no register has an address
         control_table(model)
+    assert caught.value.evidence["missing"] == list(missing)
+    assert set(caught.value.evidence["models"]) == set(model_numbers().values()) - REJECTED
+
+
+def test_row_of_a_package_without_units_is_rejected_by_its_name(monkeypatch):
+    row = DynamixelModel("bare", 4711, 2, known_model("xl430_w250").registers)
+    monkeypatch.setattr("rig.devices.dynamixel.registers.plugins", lambda _: [("bare", row)])
+    with pytest.raises(ConfigError, match="cannot drive a bare") as caught:
+        control_table("bare")
+    assert caught.value.evidence["missing"] == [
+        f"unit of {name}" for name in ("Goal Position", "speed", "acceleration")
+    ]
 
 
 @pytest.mark.parametrize("number", [NUMBERS[model] for model in sorted(REJECTED)])
@@ -131,7 +208,7 @@ def test_servo_that_the_rig_cannot_drive_is_rejected_when_it_answers(number):
     assert {frame[7] for frame in wires.instructions} == {1}  # ping
 
 
-@pytest.mark.parametrize(("number", "name"), [(2010, "PH54-100-S500"), (350, "XL320"), (4711, "unknown model 4711")])
+@pytest.mark.parametrize(("number", "name"), [(4000, "YM070-210-M001"), (350, "XL320"), (4711, "unknown model 4711")])
 def test_scan_and_doctor_report_a_servo_that_the_rig_cannot_drive(number, name):
     with unopened() as bench:
         bench.devices.servo.memory["Model Number"] = number
@@ -146,3 +223,22 @@ def test_scan_and_doctor_report_a_servo_that_the_rig_cannot_drive(number, name):
         bench.context.config = load_config(None, ["servo.id=9"])
         other = bench.problem("servo")
         assert (other.code, other.fix) == (FindingCode.OTHER_SERVOS, found.fix)
+
+
+@pytest.mark.parametrize("number", FACTORY_PROTOCOL_1)
+def test_mx_servo_with_the_firmware_of_the_factory_is_reported_with_the_way_to_change_it(number, monkeypatch):
+    """The servo answers in Protocol 1.0 only, and the configuration names the model with the other firmware."""
+    monkeypatch.setattr("rig.doctor.servo.BAUD_RATES", (1_000_000,))
+    for room in ("servo", "device_scan"):
+        monkeypatch.setattr(f"rig.doctor.{room}.BAUD_RATES_1", (1_000_000,))
+    model = FACTORY_PROTOCOL_1[number]
+    with unopened("servo.model=ax_12a", "servo.baud=1000000") as bench:
+        bench.devices.servo.memory["Model Number"] = number
+        bench.context.config = load_config(None, [f"servo.model={model}", "servo.baud=1000000"])
+        problem = bench.problem("servo")
+        assert problem.code == FindingCode.OTHER_SERVOS
+        assert "(2.0) with DYNAMIXEL Wizard 2.0" in problem.fix
+        scanned = [one for one in DeviceScan().find_servos(bench.context) if not isinstance(one, str)]
+        (found,) = (one for one in scanned if one.code == FindingCode.SERVO_NOT_DRIVEN)
+        assert str(found.parameters["found"]).startswith(model.replace("_", "-").upper())
+        assert found.fix == problem.fix

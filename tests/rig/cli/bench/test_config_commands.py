@@ -9,6 +9,7 @@ import pytest
 from rig.bench import bench_kind, bench_names, check_config
 from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.config import RigConfig, load_config
+from rig.config.servos import USE_ANOTHER, model_numbers
 from rig.config.values import read_values
 from rig.config.wording import blank_file, key_info
 from rig.core.clock import SystemClock
@@ -42,6 +43,26 @@ def test_check_lists_all_mistakes_with_their_lines(rig, tmp_path):
     ):
         assert line in done.stderr
     assert "8 mistakes in rig.toml" in done.stderr
+
+
+def test_check_accepts_or_rejects_each_servo_of_the_sdk_by_its_name(rig):
+    rejected = set()
+    for model in model_numbers().values():
+        done = rig("config", "check", "--set", f"servo.model={model}")
+        if done.exit_code:
+            assert done.exit_code == 3
+            assert "servo.model: the rig cannot drive this model: its row in the table of models lacks" in done.stderr
+            assert f"{USE_ANOTHER} (found '{model}')" in " ".join(done.stderr.split())
+            rejected.add(model)
+    assert len(model_numbers()) == 62
+    assert {name for name in rejected if not name.startswith("ym0")} == {"xl320", "rh_p12_rn"}
+    assert len(rejected) == 14
+
+
+@pytest.mark.parametrize(("name", "near"), [("MX-28(2.0)", "mx_28"), ("PH54-200-S500-R", "ph54_200_s500")])
+def test_check_knows_a_servo_by_the_name_on_its_label(rig, name, near):
+    done = rig("config", "check", "--set", f"servo.model={name}")
+    assert f"servo.model: unknown model; did you mean {near}?" in done.stderr
 
 
 def test_syntax_error_is_shown_with_its_line(rig, tmp_path):
