@@ -32,6 +32,8 @@ from rig.safety.motion_checks import find_servo_fault, implausible_readings
 
 QUIET_COUNTS = 3
 """Encoder counts by which readings at rest may differ: one of quantisation, the others of noise."""
+QUIET_DEG = 0.01  # less: a fine encoder shows the bench's own vibration; a view needs a tenth of a degree
+"""The same angle for a fine encoder, such as that of a P-series servo with 0.0004° for each count."""
 STILL_S = 0.01  # shorter: a slow table seems to rest; longer: each start waits
 """Time between two readings that show whether the table moves at all."""
 STALE_S = 0.05  # just more than a period of the control loop, 0.04 s
@@ -64,6 +66,11 @@ class MotionPath:
         """Trust a reading if the table can have rotated there."""
         if self.reaches(state):
             self.trusted = state
+
+
+def quiet_deg(servo: Servo) -> float:
+    """Return the angle by which the servo's readings at rest may differ."""
+    return max(QUIET_COUNTS * servo.resolution_deg, QUIET_DEG)
 
 
 def halt(
@@ -115,7 +122,7 @@ def _agreed_reading(servo: Servo, clock: Clock, path: MotionPath) -> ServoState 
         passed_s = seconds_between(earlier.time_ns, later.time_ns)
         moved_deg = later.position_deg - earlier.position_deg
         expected_deg = passed_s * (earlier.velocity_dps + later.velocity_dps) / 2
-        noise_deg = QUIET_COUNTS * servo.resolution_deg
+        noise_deg = quiet_deg(servo)
         plausible = (
             not implausible_readings(later)
             and low_deg - OVERSHOOT_DEG <= later.position_deg <= high_deg + OVERSHOOT_DEG
@@ -176,7 +183,7 @@ class Arrival:
         if seconds_between(readings[0][0], readings[-1][0]) < quiet_s:
             return False
         angles = [angle for _, angle in readings]
-        if max(angles) - min(angles) > QUIET_COUNTS * self.servo.resolution_deg:
+        if max(angles) - min(angles) > quiet_deg(self.servo):
             return False
         if quiet_s == 0 or self.gyro.bias is None:
             return True

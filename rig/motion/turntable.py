@@ -17,7 +17,7 @@ from rig.core.next_steps import START_AGAIN
 from rig.core.phrases import angle_words, budget_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
-from rig.motion.arrival import QUIET_COUNTS, Arrival, MotionPath, causes_found, halt
+from rig.motion.arrival import Arrival, MotionPath, causes_found, halt, quiet_deg
 from rig.motion.move import FIRST_REST_S, Move, equivalent_within, motion_seconds
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.safety.gyro_rotation import GyroRotationMeter, Stillness, compare
@@ -273,7 +273,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._clock.sleep(self._config.quiet_s)  # the plan paused for longer than the gyro's memory
         moved_by = self._gyro.since_rest()
         slipped = abs(moved_by.angle_deg) > 4 * moved_by.sigma_deg + self._config.backlash_deg
-        still = peak <= self._config.quiet_dps and change <= QUIET_COUNTS * self._servo.resolution_deg and not slipped
+        still = peak <= self._config.quiet_dps and change <= quiet_deg(self._servo) and not slipped
         return Stillness(peak, change, moved_by.angle_deg, still)
 
     def _waypoints(self, target_deg: float) -> tuple[float, ...]:

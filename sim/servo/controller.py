@@ -219,7 +219,8 @@ class Controller:
         return sum(a * cos(n * angle) + b * sin(n * angle) for n, (a, b) in enumerate(self.harmonics_deg, start=1))
 
     def _present_position(self) -> int:
-        noise_deg = self._world.noise.encoder_noise_deg
+        # of an X series servo; the encoder of a P series servo is before its gear
+        noise_deg = self._world.noise.encoder_noise_deg * min(self._row.deg_per_count / (360 / 4096), 1.0)
         error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
         return self._counts(self._world.rippled_deg() + error_deg)
 
