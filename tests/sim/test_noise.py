@@ -32,7 +32,6 @@ def test_model_without_noise_has_no_noise() -> None:
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("servo.model=mx_106", "xl430_w250"),
         ("servo.baud=12345", "57600"),
         ("bench.sim.noise.structure_damping=1.5", "below 1"),
     ],
