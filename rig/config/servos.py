@@ -23,7 +23,6 @@ USE_PROTOCOL_2 = (
 _PACKAGE, _FOLDER = "dynamixel_easy_sdk", "control_table"
 # Names that differ between the .model files and the e-manual.
 _RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdog"}
-
 _UNLISTED: Final = {1280: "xw430_t200"}  # e-manual, XW430-T200: the SDK has its file, but not its number
 
 FACTORY_PROTOCOL_1: Final = {29: "mx_28", 310: "mx_64", 320: "mx_106"}
@@ -89,12 +88,14 @@ class DynamixelModel:
         names = {name for _, _, name in self.registers}
         units = {"Goal Position": self.deg_per_count, "speed": self.dps_per_unit, "acceleration": self.dps2_per_unit}
         lacks = [name for name in _USED[self.protocol] if name not in names]
+        if not self.most_units and "Acceleration Limit" not in names:
+            lacks.append("Acceleration Limit")
         if "Present Current" in names:
             lacks += [] if "Current Limit" in names else ["Current Limit"]
             units["Present Current"] = self.ma_per_unit
         elif "Present Load" not in names:
             lacks.append("Present Load")
-        return *lacks, *(f"unit of {what}" for what, unit in units.items() if not unit)
+        return *lacks, *(f"the unit of {what}" for what, unit in units.items() if not unit)
 
 
 _X: Final[dict[str, Any]] = {

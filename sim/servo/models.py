@@ -17,6 +17,8 @@ GROUP = "rig.simulated_servos"
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate."""
 
+_VOLTAGES = "Min Voltage Limit", "Max Voltage Limit"
+
 VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE = 1, 3, 4
 
 GAINS = (
@@ -52,8 +54,6 @@ _RANGES: dict[str, Container[int]] = {
     "Homing Offset": range(-1_044_479, 1_044_480),
     "Moving Threshold": range(1024),
     "Temperature Limit": range(101),
-    "PWM Limit": range(886),
-    "Acceleration Limit": range(32_768),
     "Velocity Limit": range(1024),
     "Torque Enable": range(2),
     "LED": range(2),
@@ -118,17 +118,21 @@ def _model(
 ) -> ServoModel:
     """Return a model with its initial limits, velocity gains (I, P) and Position P Gain; ``ranges`` of other registers.
 
-    The voltage limits range from ``lowest_voltage`` (default: the initial lower limit) to the initial upper limit.
+    The voltage limits range from ``lowest_voltage`` (default: the initial lower limit) to the initial upper limit. The
+    limits of PWM, current and acceleration can only be reduced.
     """
     low, high = voltage
     volts = range(low if lowest_voltage is None else lowest_voltage, high + 1)
-    own = {"Temperature Limit": temperature, "Min Voltage Limit": low, "Max Voltage Limit": high}
+    own = {"Temperature Limit": temperature, **dict(zip(_VOLTAGES, voltage, strict=True))}
     own |= dict(zip(("Velocity I Gain", "Velocity P Gain", "Position P Gain"), gains, strict=True))
+    first = _INITIAL | own | {"Velocity Limit": velocity} | dict(initial)
+    falling = (name for name in ("PWM Limit", "Current Limit", "Acceleration Limit") if name in first)
+    limits = {name: range(first[name] + 1) for name in falling} | dict.fromkeys(_VOLTAGES, volts)
     return ServoModel(
         name,
         firmware,
-        MappingProxyType(_INITIAL | own | {"Velocity Limit": velocity} | dict(initial)),
-        MappingProxyType(_RANGES | {"Max Voltage Limit": volts, "Min Voltage Limit": volts} | dict(ranges)),
+        MappingProxyType(first),
+        MappingProxyType(_RANGES | limits | dict(ranges)),
         supply_v,
         no_load_rpm * 6.0,
         stall_current=stall_current,
@@ -157,7 +161,6 @@ _MODELS = (
         velocity=200,
         gains=(1920, 100, 800),
         initial={"Current Limit": 1193},
-        ranges={"Current Limit": range(1194)},
         stall_current=855,
     ),
     _model(
@@ -173,7 +176,6 @@ _MODELS = (
         initial={"Current Limit": 1750, "PWM Slope": 140, "Shutdown": 53},
         ranges={
             "Baud Rate": range(7),
-            "Current Limit": range(1751),
             "Velocity Limit": range(2048),
             "PWM Slope": range(1, 256),
         },
@@ -208,9 +210,6 @@ _MODELS = (
         ranges={
             "Homing Offset": range(-(2**31), 2**31),
             "Moving Threshold": range(2901),
-            "PWM Limit": range(2010),
-            "Current Limit": range(22_741),
-            "Acceleration Limit": range(3_992_645),
             "Velocity Limit": range(2901),
             **dict.fromkeys(GAINS, range(32_768)),
             "Profile Acceleration": range(3_992_645),

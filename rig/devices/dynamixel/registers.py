@@ -26,20 +26,9 @@ from rig.core.plugins import plugins
 # The signed registers of the e-manual's control tables: the .model files mark the sign of few registers.
 _SIGNED = frozenset(
     {
-        "Homing Offset",
-        "Max Position Limit",
-        "Min Position Limit",
-        "Goal PWM",
-        "Goal Current",
-        "Goal Velocity",
-        "Goal Position",
-        "Present PWM",
-        "Present Current",
-        "Present Load",
-        "Present Velocity",
-        "Present Position",
-        "Velocity Trajectory",
-        "Position Trajectory",
+        *("Homing Offset", "Max Position Limit", "Min Position Limit", "Goal PWM", "Goal Current", "Goal Velocity"),
+        *("Goal Position", "Present PWM", "Present Current", "Present Load", "Present Velocity", "Present Position"),
+        *("Velocity Trajectory", "Position Trajectory"),
     }
 )
 # A register that is missing in the .model files: (address, size, name), and its first firmware by model.

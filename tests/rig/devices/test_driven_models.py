@@ -191,9 +191,8 @@ def test_row_of_a_package_without_units_is_rejected_by_its_name(monkeypatch):
     monkeypatch.setattr("rig.devices.dynamixel.registers.plugins", lambda _: [("bare", row)])
     with pytest.raises(ConfigError, match="cannot drive a bare") as caught:
         control_table("bare")
-    assert caught.value.evidence["missing"] == [
-        f"unit of {name}" for name in ("Goal Position", "speed", "acceleration")
-    ]
+    units = [f"the unit of {name}" for name in ("Goal Position", "speed", "acceleration")]
+    assert caught.value.evidence["missing"] == ["Acceleration Limit", *units]
 
 
 @pytest.mark.parametrize("number", [NUMBERS[model] for model in sorted(REJECTED)])
