@@ -14,6 +14,7 @@ from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import cv2
 import pytest
 import typer.testing
 from hypothesis import settings
@@ -41,6 +42,9 @@ gc.disable()
 
 # Typer builds all commands for each invocation, which takes longer than most commands.
 typer.testing._get_command = cache(typer.testing._get_command)
+
+# The workers use all cores already. OpenCV's own threads would wait for each other at each of its many small calls.
+cv2.setNumThreads(1)
 
 # Tests start many processes, and compiled modules save a fifth of the time of each.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -255,9 +255,10 @@ def test_busy_catalog_is_reported_after_the_timeout(two: Rig, monkeypatch: pytes
 INTERRUPTED = """
 import os, signal
 from contextlib import closing
-from rig.catalog import incoming
+from rig.catalog import incoming, jobs
 from rig.cli.main import main
 
+jobs.PORTION = 8  # so that few photographs are enough for two processes
 staged = incoming.map_in_processes
 
 def interrupted(*arguments):
@@ -272,7 +273,7 @@ main()
 
 
 def test_interrupted_import_leaves_images_only(tmp_path: Path) -> None:
-    photographs(tmp_path / "in", *(f"obj{n}" for n in range(4)), step_deg=5)  # enough for two processes
+    photographs(tmp_path / "in", "jar", step_deg=5)
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
     words = [sys.executable, "-c", INTERRUPTED, "import", "in", "--jobs", "2"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, start_new_session=True, timeout=60)
