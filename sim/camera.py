@@ -26,7 +26,7 @@ from sim.objects.solid import empty_platter
 from sim.optics import Optics
 from sim.rolling_shutter import bands, row_weights
 from sim.room import relight, room
-from sim.sensor import Sensor
+from sim.sensor import STRIP, Sensor
 from sim.visit import seen_on_visit
 from sim.world import HISTORY_S, Activity, Scene, World
 
@@ -364,8 +364,10 @@ class SimCapture:
             exposed = np.flatnonzero(weight)
             if len(exposed):
                 rows = int(exposed[0]), int(exposed[-1]) + 1
-                part = slice(*rows)
-                seen[part] += self._picture(scene, float(angle), rows)[part] * weight[part, None, None]
+                picture = self._picture(scene, float(angle), rows)
+                for top in range(*rows, STRIP):
+                    part = slice(top, min(top + STRIP, rows[1]))
+                    seen[part] += picture[part] * weight[part, None, None]
         return seen
 
     def _picture(self, scene: Scene, table_deg: float, rows: tuple[int, int] = (0, HEIGHT)) -> Image:

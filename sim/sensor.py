@@ -22,7 +22,7 @@ _WAVELENGTHS_NM = (465.0, 540.0, 610.0)  # middles of the bands of usual filters
 # Noise is drawn once, because it takes longer than a frame; each frame takes another part of the tile. Larger: frames
 # are less alike, and the start takes longer.
 _TILE_MARGIN = 128
-_STRIP = 32  # rows that are computed together: they stay in the processor's cache
+STRIP = 32  # rows that are computed together: they stay in the processor's cache
 
 
 class Sensor:
@@ -96,8 +96,8 @@ class Sensor:
             tile = self._tile[y : y + height, x : x + width]
         image = np.empty((height, width, 3), dtype=np.uint8)
         scale = max(flicker, 0.0) * exposure
-        for top in range(0, height, _STRIP):
-            rows = np.s_[top : top + _STRIP]
+        for top in range(0, height, STRIP):
+            rows = np.s_[top : top + STRIP]
             signal = cv2.multiply(scene[rows], self._light_map[rows], scale=scale, dtype=cv2.CV_32F)
             if tile is not None:
                 # var = levels_per_e · signal + (levels_per_e · read noise)²: EMVA 1288, in grey levels

@@ -46,6 +46,12 @@ typer.testing._get_command = cache(typer.testing._get_command)
 # The workers use all cores already. OpenCV's own threads would wait for each other at each of its many small calls.
 cv2.setNumThreads(1)
 
+# By default glibc returns the memory of each image to the system, which clears it for the next one. That takes longer
+# than most computing with images. Workers, and programs that start later, keep 32 MiB. The limit of memory in
+# `tests.fuzzing` allows no more.
+for option in ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"):
+    os.environ.setdefault(option, str(2**25))
+
 # Tests start many processes, and compiled modules save a fifth of the time of each.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
