@@ -145,7 +145,7 @@ SECTIONS: Final = {
     "Exchange and log": ("import", "export", "log"),
     "Table": ("home", "goto", "jog"),
     "Devices and settings": ("setup", "find", "config", "calibrate", "snapshot", "servo", "head"),
-    "Simulated bench": ("demo", "faults", "sim-bench", "sim-head", "sim-servo"),
+    "Simulated bench": ("demo", "faults", "sim-bench"),
 }
 """The sections of the help, with their commands in order. The first one has the commands of a day."""
 

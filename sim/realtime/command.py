@@ -1,4 +1,4 @@
-"""`rig sim-bench`, `rig sim-servo` and `rig sim-head`: simulated devices in real time, for other programs."""
+"""`rig sim-bench`: a simulated bench in real time, for other programs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,9 +7,6 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
-
-Link = Annotated[Path | None, typer.Option(metavar="PATH", help="Create this link to the port while the program runs.")]
-Seconds = Annotated[float | None, typer.Option(min=0, help="Stop after this time (default: until Ctrl+C).")]
 
 
 @command
@@ -23,7 +20,7 @@ def sim_bench(
         Path | None,
         typer.Option(metavar="FOLDER", help="Folder of the bench (default: sim-bench, or that of rig.toml)."),
     ] = None,
-    seconds: Seconds = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this time (default: until Ctrl+C).")] = None,
 ) -> None:
     """Run a simulated bench in real time: servo, IMU, camera and table of one world, for several programs at once.
 
@@ -44,43 +41,3 @@ def sim_bench(
     from sim.realtime.run import run_bench
 
     run_bench(settings, folder, seconds)
-
-
-@command
-def sim_servo(
-    settings: Settings,
-    ids: Annotated[
-        list[int] | None, typer.Option("--id", min=0, max=252, help="Id of a servo. Repeatable (default: servo.id).")
-    ] = None,
-    link: Link = None,
-    seconds: Seconds = None,
-) -> None:
-    """Simulate servos on a pseudo-terminal in real time, and print the port to connect to.
-
-    Model, id and gear ratio come from the section [servo]. The port accepts any baud rate.
-
-    Example: rig sim-servo --set servo.model=xm430_w350 --id 1 --id 2
-    """
-    from sim.realtime.run import run_servos
-
-    run_servos(settings, ids, link, seconds)
-
-
-@command
-def sim_head(
-    settings: Settings,
-    spin: Annotated[
-        float, typer.Option(metavar="DPS", help="Rotate the platter at this speed, in degrees per second.")
-    ] = 0.0,
-    link: Link = None,
-    seconds: Seconds = None,
-) -> None:
-    """Simulate a rig head with its IMU on a pseudo-terminal in real time, and print the port to connect to.
-
-    Changes of its outputs are printed. Model and address of the IMU come from the section [imu].
-
-    Example: rig sim-head --spin 30
-    """
-    from sim.realtime.run import run_head
-
-    run_head(settings, spin, link, seconds)

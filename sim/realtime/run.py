@@ -1,9 +1,9 @@
-"""Runs simulated devices in real time: a whole bench, servos alone, or a rig head alone."""
+"""Runs a simulated bench in real time."""
 
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -18,7 +18,6 @@ from sim.devices import SimDevices
 from sim.faults import Faults
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
-from sim.motion import to_velocity
 from sim.objects.shelf import shelf
 from sim.realtime import folder as folders
 from sim.realtime.bench import RunningSimBench
@@ -27,10 +26,7 @@ from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
 from sim.realtime.server import BenchServer
 from sim.realtime.wire import COMPUTER, HEAD, SERVO
-from sim.servo import ServoBus, SimSerial
 from sim.servo.base import BOOT_S
-from sim.servo.configured import simulated_servo
-from sim.world import World
 
 
 def run_bench(settings: Settings, folder: Path | None, seconds: float | None) -> None:
@@ -77,51 +73,6 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         with suppress(KeyboardInterrupt):  # Ctrl+C is the usual end
             time.run(seconds, inputs)
     settings.say("The simulated bench has ended.", {"ended": True})
-
-
-def run_servos(settings: Settings, ids: Sequence[int] | None, link: Path | None, seconds: float | None) -> None:
-    """Run servos on one bus, each in its own world."""
-    config = settings.load()
-    wanted = sorted(set(ids or [config.servo.id]))
-    bus: ServoBus | None = None
-    for bus_id in wanted:
-        world = World(seed=(settings.seed or 0) + bus_id, clock=bus.clock if bus else None)
-        bus = bus or ServoBus(world.clock)
-        bus.attach(simulated_servo(world, config.servo.model_copy(update={"id": bus_id})))
-    assert bus is not None
-    with ExitStack() as ends:
-        adapter = SimSerial(bus, config.servo.baud, 0.0)
-        port = _port(lambda: adapter, link, ends)
-        if settings.json:
-            settings.print_json({"port": port.path, "model": config.servo.model, "ids": wanted})
-        else:
-            print(port.path, flush=True)
-            what = f"{config.servo.model}, id {', '.join(map(str, wanted))}"
-            print(f"{what}. Use it with --set servo.port={port.path}. Stop with Ctrl+C.", file=sys.stderr)
-        RealTime(bus.clock, [port]).run(seconds)
-
-
-def run_head(settings: Settings, spin_dps: float, link: Path | None, seconds: float | None) -> None:
-    """Run a rig head with its IMU on a platter that rotates at ``spin_dps``."""
-    config = settings.load()
-    config = config.model_copy(update={"imu": config.imu.model_copy(update={"connection": "head"})})
-    world = World(seed=settings.seed or 0)
-    with ExitStack() as ends:
-        devices = ends.enter_context(SimDevices.connected(config, world))
-        assert devices.head is not None
-        devices.head.listeners.append(
-            lambda change: print(f"{change.time_ns * 1e-9:.4f} s: {change.pin} {change.value:g}", file=sys.stderr)
-        )
-        if spin_dps:
-            world.drive(to_velocity(0.0, 0.0, spin_dps, abs(spin_dps), 100.0))
-        port = _port(devices.head_port, link, ends)
-        if settings.json:
-            settings.print_json({"port": port.path, "imu": config.imu.model})
-        else:
-            print(port.path, flush=True)
-            where = f"--set imu.connection=head --set head.port={port.path}"
-            print(f"{config.imu.model} on a rig head. Use it with {where}. Stop with Ctrl+C.", file=sys.stderr)
-        RealTime(world.clock, [port]).run(seconds)
 
 
 class _Keyboard:

@@ -1,4 +1,4 @@
-"""Requests of any program at the port of `rig sim-servo`."""
+"""Requests of any program at the servo port of `rig sim-bench`."""
 
 import pytest
 from hypothesis import example, given

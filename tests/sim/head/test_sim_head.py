@@ -1,6 +1,5 @@
-"""`rig sim-head` as another program sees it: a real process, a real (pseudo) terminal, real time."""
+"""The emulated rig head as another program sees it: a real (pseudo) terminal, real time."""
 
-import json
 from contextlib import closing
 from threading import Thread
 
@@ -18,8 +17,7 @@ from sim.noise import NoiseModel
 from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
 from sim.world import World
-from tests.contract.heads import head_of, mpu6050, needs
-from tests.programs import Program
+from tests.contract.heads import head_of, mpu6050
 
 PATIENCE_S = 100.0
 
@@ -51,19 +49,6 @@ def check_head(port, monkeypatch):
     assert samples.gyro_dps[:, 2] - samples.gyro_dps[:, 2].mean() == pytest.approx(0.0, abs=0.5 + ripple_dps)
     assert 20 < samples.gyro_dps[:, 2].mean() < 40  # 30, and the zero of an uncalibrated gyro
     head.close()
-
-
-def test_program_with_pyserial_finds_a_head(tmp_path, monkeypatch):
-    needs("memory")
-    arguments = ("--json", "--spin", "30", "--seconds", "600", "--link", "head")
-    program = Program("sim-head", *arguments, folder=tmp_path)
-    try:
-        started = json.loads(program.stdout.readline())
-        assert started["imu"] == "mpu6050"
-        assert (tmp_path / "head").resolve() == (tmp_path / started["port"]).resolve()
-        check_head(str(tmp_path / "head"), monkeypatch)
-    finally:
-        program.close()
 
 
 def test_program_with_pyserial_finds_the_emulated_binary(monkeypatch):

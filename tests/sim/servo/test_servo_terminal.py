@@ -1,11 +1,7 @@
-"""`rig sim-servo` as other programs see it: a real process, a real (pseudo) terminal, real time."""
+"""Simulated servos as other programs see them: a real process, a real (pseudo) terminal, real time."""
 
-import json
-import os
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
@@ -16,29 +12,27 @@ from rig.devices.dynamixel.port import open_serial
 from rig.devices.dynamixel.servo import open_servo
 from rig.devices.servo import MotionProfile
 from tests.programs import Program
+from tests.sim.servo.served import start
 
 
 @pytest.fixture
-def sim_servo(tmp_path: Path) -> Iterator[Callable[..., dict[str, Any]]]:
-    """Return a function that starts `rig sim-servo` and returns what it says about itself."""
+def serving(tmp_path: Path) -> Iterator[Callable[..., str]]:
+    """Return a function that starts servos in another process and returns their port, a link of a fixed name."""
     running: list[Program] = []
 
-    def start(*options: str) -> dict[str, Any]:
-        process = Program("sim-servo", "--json", "--seconds", "600", *options, folder=tmp_path)
-        running.append(process)
-        assert process.stdout is not None
-        started: dict[str, Any] = json.loads(process.stdout.readline())
-        return started | {"process": process}
+    def serve(*ids: int, **model: str) -> str:
+        running.append(start(tmp_path / "servo", *ids, **model))
+        return str(tmp_path / "servo")
 
-    yield start
+    yield serve
     for process in running:
         process.close()
 
 
-def test_rustypot_drives_an_xl430(sim_servo: Callable[..., dict[str, Any]]) -> None:
+def test_rustypot_drives_an_xl430(serving: Callable[..., str]) -> None:
     rustypot = pytest.importorskip("rustypot")
-    started = sim_servo("--id", "1", "--id", "4")
-    servo = rustypot.Xl430PyController(started["port"], 1_000_000, 30.0)
+    port = serving(1, 4)
+    servo = rustypot.Xl430PyController(port, 1_000_000, 30.0)
     assert [servo.ping(i) for i in (1, 4)] == [True, True]
     assert servo.read_model_number(1) in (1060, [1060])
     servo.write_operating_mode(1, 4)
@@ -54,28 +48,26 @@ def test_rustypot_drives_an_xl430(sim_servo: Callable[..., dict[str, Any]]) -> N
     servo.close()
 
 
-def test_rustypot_drives_an_ax12(sim_servo: Callable[..., dict[str, Any]]) -> None:
+def test_rustypot_drives_an_ax12(serving: Callable[..., str]) -> None:
     rustypot = pytest.importorskip("rustypot")
-    started = sim_servo("--set", "servo.model=ax_12a")
-    servo = rustypot.AxPyController(started["port"], 1_000_000, 30.0)
+    port = serving(model="ax_12a")
+    servo = rustypot.AxPyController(port, 1_000_000, 30.0)
     assert servo.ping(1)
     assert servo.read_model_number(1) in (12, [12])
     assert servo.read_raw_present_position(1) in (512, [512])
     servo.close()
 
 
-def test_sdk_and_rig_driver_find_the_servo(
-    sim_servo: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sdk_and_rig_driver_find_the_servo(serving: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
     """One after the other, through a link of a fixed name; in real time the driver moves it, and sees it move."""
     monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 30_000)  # ms: the other process may have to wait
-    sim_servo("--link", str(tmp_path / "servo"))
-    port = PortHandler(str(tmp_path / "servo"))
+    link = serving()
+    port = PortHandler(link)
     assert port.openPort()
     assert Protocol2PacketHandler().ping(port, 1) == (1060, COMM_SUCCESS, 0)
     port.closePort()
     clock = SystemClock()
-    wire = open_serial(str(tmp_path / "servo"), 57_600)
+    wire = open_serial(link, 57_600)
     servo = open_servo(wire, ServoConfig(), clock)
     servo.prepare(write=True)
     servo.set_profile(MotionProfile(180.0, 2000.0))
@@ -92,10 +84,3 @@ def test_sdk_and_rig_driver_find_the_servo(
     assert servo.bus_statistics["retries"] == 0
     servo.torque_off()
     servo.close()
-
-
-def test_stop_removes_the_link_and_ends_reads(sim_servo: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
-    started = sim_servo("--link", str(tmp_path / "servo"))
-    started["process"].send_signal(signal.SIGTERM)
-    assert started["process"].wait(60) == 143
-    assert not os.path.lexists(tmp_path / "servo")

@@ -22,6 +22,7 @@ from rig.devices.dynamixel.port import GUARDIAN, open_serial
 from rig.devices.dynamixel.servo import open_servo
 from sim.realtime.wire import send_command
 from tests.programs import Program
+from tests.sim.servo.served import start
 
 pytestmark = pytest.mark.realtime
 
@@ -95,8 +96,7 @@ app()
 def servo(tmp_path):
     """Return the settings of a servo that another process simulates in real time."""
     link = tmp_path / "servo"
-    process = Program("sim-servo", "--json", "--seconds", "600", "--link", str(link))
-    assert json.loads(process.stdout.readline())["ids"] == [1]
+    process = start(link)
     yield [
         f"servo.port={str(link)!r}",
         f"state_dir={str(tmp_path / 'state')!r}",
