@@ -18,7 +18,7 @@ from typing import Any, Final
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import ConfigError, JobRejected, LeaseHeld, LoginRequired, StateNotStored, os_errors_as
+from rig.core.errors import ConfigError, LeaseHeld, LoginRequired, StateNotStored, os_errors_as
 from rig.core.files import read, write
 from rig.core.next_steps import Do
 
@@ -30,7 +30,6 @@ SESSION_S: Final = 12 * 3600.0
 MAX_SESSIONS: Final = 1000  # a script that logs in for each request must not fill the memory; the oldest session ends
 LEASE_S: Final = 45.0
 """Time after which a lease that is not renewed is free, because the operator's browser was closed."""
-MAX_ASKED: Final = 100  # persons who asked for the lease and are remembered
 
 
 def new_token() -> str:
@@ -237,7 +236,6 @@ class Lease:
     changed: Callable[[dict[str, Any]], None]
     _holder: Person | None = None
     _until_ns: int = 0
-    _asked: dict[tuple[str, str], Person] = field(default_factory=dict)
     _lock: threading.RLock = field(default_factory=threading.RLock)
 
     @property
@@ -264,44 +262,13 @@ class Lease:
             if before is not None and not renewed and not force:
                 raise LeaseHeld(
                     f"{before.name} uses the bench now.",
-                    next_step="Wait, ask for it, or take it over. The other operator is then warned.",
+                    next_step="Wait, or take it over. The other operator is then warned.",
                     evidence={"holder": before.name},
                 )
-            if not renewed:
-                self._asked.clear()
             self._holder = person
             self._until_ns = self.clock.now_ns() + round(LEASE_S * 1e9)
         if not renewed:
             self.changed(self.as_json(taken_from=before))
-
-    def ask(self, person: Person) -> None:
-        """Ask the operator who has the lease to hand it over."""
-        with self._lock:
-            self._asked[person.key] = person
-            while len(self._asked) > MAX_ASKED:
-                del self._asked[next(iter(self._asked))]
-        self.changed({**self.as_json(), "asked_by": person.as_json()})
-
-    def hand_over(self, person: Person, name: str, client: str) -> None:
-        """Give the lease to another operator who asked for it.
-
-        Raises
-        ------
-        LeaseHeld
-            ``person`` does not have it.
-        JobRejected
-            No operator of that name asked for it.
-        """
-        with self._lock:
-            if not self.is_held_by(person):
-                raise LeaseHeld("You do not have the lease.", next_step="Take it first.")
-            to = self._asked.get((name, client))
-            if to is None:
-                raise JobRejected(
-                    f"{name} has not asked for the bench.", next_step="Wait until another operator asks for it."
-                )
-            self._holder = None
-            self.take(to)
 
     def release(self, person: Person) -> None:
         """Give the lease back; nothing happens if another operator has it."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Annotated, Any, Final, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from fastapi import Response
 from fastapi.responses import StreamingResponse
@@ -14,7 +14,6 @@ from rig.events.events import DESCRIBED, Event, JsonEvent
 from rig.web.access import Role
 
 Row = TypeVar("Row")
-BOUNDARY: Final = "frame"
 
 
 def time_text(at: datetime) -> str:
@@ -201,9 +200,3 @@ class EventStream(StreamingResponse):
     """Server-sent events."""
 
     media_type = "text/event-stream"
-
-
-class LivePictures(StreamingResponse):
-    """The camera's frames as MJPEG."""
-
-    media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"

@@ -16,7 +16,6 @@ from rig.web.answers import (
     Jpeg,
     LeaseState,
     ListOf,
-    LivePictures,
     Login,
     Me,
     Stopped,
@@ -24,10 +23,9 @@ from rig.web.answers import (
 )
 from rig.web.hub import MAX_LISTENERS
 from rig.web.problems import problem
-from rig.web.requests import AnswerBody, HandOverBody, Job, JobRequest, LeaseBody, LoginBody
+from rig.web.requests import AnswerBody, Job, JobRequest, LeaseBody, LoginBody
 from rig.web.server import API, COOKIE, OperatorPerson, Page, Routes, Server, Watcher, require_operate
 
-MAX_VIEWERS: Final = 50  # each loads the network and the process that receives STOP
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
     201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
 }
@@ -61,29 +59,11 @@ def add_access(routes: Routes, server: Server) -> None:
         mine = server.lease.is_held_by(person)
         return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
 
-    @routes.watch.get("/lease", tags=["access"], response_model=LeaseState)
-    def get_lease() -> Any:
-        """Return who has the lease."""
-        return server.lease.as_json()
-
     @routes.watch.post("/lease", tags=["access"], response_model=LeaseState)
     def take_lease(body: LeaseBody, person: Watcher) -> Any:
         """Take or renew the lease."""
         require_operate(person)
         server.lease.take(person, force=body.force)
-        return server.lease.as_json()
-
-    @routes.watch.post("/lease/ask", tags=["access"], response_model=LeaseState)
-    def ask_for_lease(person: Watcher) -> Any:
-        """Ask the operator who has the lease to hand it over."""
-        require_operate(person)
-        server.lease.ask(person)
-        return server.lease.as_json()
-
-    @routes.watch.post("/lease/hand-over", tags=["access"], response_model=LeaseState)
-    def hand_over_lease(body: HandOverBody, person: Watcher) -> Any:
-        """Give the lease to an operator who asked for it."""
-        server.lease.hand_over(person, body.name, body.client)
         return server.lease.as_json()
 
     @routes.watch.delete("/lease", tags=["access"], response_model=LeaseState)
@@ -100,7 +80,7 @@ def add_bench(routes: Routes, server: Server) -> None:
         return {
             **server.remote.status,
             "bench": server.setup.bench,
-            "server": {"viewers": server.remote.viewers, "listeners": server.hub.listeners},
+            "server": {"listeners": server.hub.listeners},
             "catalog": server.catalog.state,
             "problem": server.remote.status.get("problem") or (problem(server.damage) if server.damage else None),
         }
@@ -115,7 +95,10 @@ def add_bench(routes: Routes, server: Server) -> None:
         request: Request, last_event_id: Annotated[str | None, Header(max_length=64)] = None
     ) -> EventStream:
         """Send events: plan, job, status, lease, stop. `Last-Event-ID` continues after a lost connection."""
-        _check_number(server.hub.listeners, MAX_LISTENERS)
+        if server.hub.listeners >= MAX_LISTENERS:
+            raise TooManyListeners(
+                f"{MAX_LISTENERS} streams are open already.", next_step="Close some pages or programs, then try again."
+            )
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return EventStream(server.hub.stream(last_event_id, lambda: server.still_allowed(request)), headers=headers)
 
@@ -146,13 +129,6 @@ def add_bench(routes: Routes, server: Server) -> None:
             raise JobNotFound("The camera has given no frame yet.", next_step="Try again in a second.")
         return Jpeg(content, headers={"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"})
 
-    @routes.watch.get("/live", tags=["bench"], response_class=LivePictures)
-    async def stream_pictures(request: Request) -> LivePictures:
-        """Send the camera's frames as MJPEG."""
-        _check_number(server.remote.viewers, MAX_VIEWERS)
-        pictures = server.remote.pictures(lambda: server.still_allowed(request))
-        return LivePictures(pictures, headers={"Cache-Control": "no-store"})
-
 
 async def _send_events(server: Server, socket: WebSocket) -> None:
     """Send the hub's messages to a page until it has gone or may not listen any more."""
@@ -163,14 +139,6 @@ async def _send_events(server: Server, socket: WebSocket) -> None:
                 head = json.dumps({"kind": message.kind, "id": server.hub.id_of(message)})
                 await socket.send_text(f'{head[:-1]}, "data": {message.data}}}')
     await socket.close(1008)
-
-
-def _check_number(present: int, most: int) -> None:
-    if present >= most:
-        raise TooManyListeners(
-            f"{present} streams of this kind are open already.",
-            next_step="Close some pages or programs, then try again.",
-        )
 
 
 def add_jobs(routes: Routes, server: Server) -> None:

@@ -91,7 +91,6 @@ class _Numbers(Collector):
             ("table_degrees", "Angle of the table.", status.get("table_deg")),
             ("servo_temperature_celsius", "Temperature.", servo.get("temperature_c")),
             ("servo_volts", "Supply voltage.", servo.get("voltage_v")),
-            ("viewers", "Open live pictures.", server.remote.viewers),
             ("event_listeners", "Open streams of events.", server.hub.listeners),
         ):
             if value is not None:

@@ -147,7 +147,6 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
 
     def ended() -> None:
         web.should_exit = True
-        server.remote.closed = True
         server.hub.close()
         threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
 

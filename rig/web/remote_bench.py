@@ -2,19 +2,16 @@
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 from rig.core.clock import Clock, seconds_between
 from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
-from rig.web.answers import BOUNDARY
 from rig.web.link import Link
 
 PICTURE_S: Final = 0.08
-"""Shortest time between two pictures that are fetched from the bench, for all viewers together."""
-VIEWER_GONE_S: Final = 30.0
-"""A stream of pictures sends the last one again after this time, to notice a viewer that is gone."""
+"""Shortest time between two pictures that are fetched from the bench, for all pages together."""
 CONFIRM_S: Final = 3.0
 """How long a request to stop is held until the bench has confirmed it; the page warns after one second."""
 
@@ -33,8 +30,6 @@ class RemoteBench:
         self._received = received
         self.status: dict[str, Any] = {"open": False, "job": None, "error": None}
         """The last known state of the bench."""
-        self.viewers = 0
-        self.closed = False
         self._newest: tuple[int, bytes] = (0, b"")
         self._age_s: float | None = None
         self._fetched_ns: int | None = None
@@ -84,19 +79,3 @@ class RemoteBench:
                 if content:
                     self._newest = (values["number"], content)
             return (*self._newest, self._age_s)
-
-    async def pictures(self, still_allowed: Callable[[], bool]) -> AsyncIterator[bytes]:
-        """Yield the parts of a ``multipart/x-mixed-replace`` response, each frame at most once."""
-        self.viewers += 1
-        sent, waited_s = 0, 0.0
-        try:
-            while not self.closed and still_allowed():
-                number, content, _ = await self.picture()
-                if content and (number != sent or waited_s > VIEWER_GONE_S):
-                    sent, waited_s = number, 0.0
-                    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(content)}\r\n\r\n"
-                    yield head.encode() + content + b"\r\n"
-                await asyncio.sleep(PICTURE_S)
-                waited_s += PICTURE_S
-        finally:
-            self.viewers -= 1

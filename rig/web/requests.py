@@ -222,13 +222,6 @@ class LeaseBody(_Request):
     force: bool = Field(False, description="take it over from another operator, who is warned")
 
 
-class HandOverBody(_Request):
-    """Who gets the lease."""
-
-    name: Annotated[str, Field(max_length=50)]
-    client: Annotated[str, Field(max_length=64)] = ""
-
-
 class AnswerBody(_Request):
     """The answer to the question of a job."""
 

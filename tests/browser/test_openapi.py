@@ -13,7 +13,7 @@ from tests.rig.web.conftest import connected
 schemathesis = pytest.importorskip("schemathesis", reason="Schemathesis is missing: make test-web installs it")
 
 pytestmark = pytest.mark.nightly  # make test-web runs it
-ENDLESS = ("/api/v1/events", "/api/v1/live")
+ENDLESS = ("/api/v1/events",)
 EXAMPLES = 15
 
 

@@ -237,18 +237,12 @@ on("lease", (lease) => {
   if (me === null) return;
   showLease(lease);
   if (lease.taken_from && lease.taken_from.name === me.name && lease.taken_from.client === CLIENT) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, steps: ["You can watch."] }));
-  if (lease.asked_by && $("lease-button").dataset.mine) {
-    const to = lease.asked_by;
-    const handOver = h("button", { onclick: () => act(() => request("POST", "/lease/hand-over", to)) }, "Hand over the bench");
-    $("messages").replaceChildren(h("p", {}, `${to.name} asks for the bench. `, handOver));
-  }
 });
 
 function offerLease() {
   $("lease-text").textContent = "Another operator uses the bench. If you take over, a running job continues, and the other operator sees a message.";
   const dialog = $("lease-dialog");
   dialog.onclose = () => {
-    if (dialog.returnValue === "ask") act(() => request("POST", "/lease/ask"));
     if (dialog.returnValue === "force") act(() => request("POST", "/lease", { force: true }));
   };
   dialog.show();

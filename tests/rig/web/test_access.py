@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from rig.core.errors import ConfigError, JobRejected, LeaseHeld, LoginRequired
+from rig.core.errors import ConfigError, LeaseHeld, LoginRequired
 from rig.web.access import LEASE_S, SESSION_S, Lease, Person, Role, Sessions, Tokens
 from sim.clock import VirtualClock
 
@@ -87,21 +87,6 @@ def test_name_of_a_token_can_be_read_and_is_not_that_of_the_computer(sessions, n
         sessions.tokens.new(name, Role.WATCH)
 
 
-def test_lease_is_handed_over_only_to_an_operator_who_asked(clock):
-    lease = Lease(clock, lambda _values: None)
-    anna, ben = Person("anna", Role.OPERATE, "1"), Person("ben", Role.OPERATE, "2")
-    lease.take(anna)
-    with pytest.raises(JobRejected):
-        lease.hand_over(anna, ben.name, ben.client)
-    lease.ask(ben)
-    with pytest.raises(JobRejected):
-        lease.hand_over(anna, "ben", "3")
-    lease.hand_over(anna, ben.name, ben.client)
-    assert lease.holder == ben
-    with pytest.raises(JobRejected):
-        lease.hand_over(ben, anna.name, anna.client)  # each request counts once
-
-
 def test_name_with_a_slash_is_not_another_persons_key():
     lease = Lease(VirtualClock(), lambda _values: None)
     lease.take(Person("tablet", Role.OPERATE, "1/2"))
@@ -118,7 +103,6 @@ class LeaseMachine(RuleBasedStateMachine):
         self.events = []
         self.lease = Lease(self.clock, self.events.append)
         self.holder, self.until = None, 0.0
-        self.asked = set()
 
     people = st.sampled_from(
         [Person("a", Role.OPERATE, "1"), Person("a", Role.OPERATE, "2"), Person("b", Role.OPERATE)]
@@ -137,7 +121,6 @@ class LeaseMachine(RuleBasedStateMachine):
             return
         self.lease.take(person, force=force)
         if self.holder != person:
-            self.asked.clear()
             assert self.events[-1]["client"] == person.client
             assert self.events[-1]["taken_from"] == (self.holder.as_json() if self.holder else None)
         self.holder, self.until = person, self.clock.now_ns() * 1e-9 + LEASE_S
@@ -148,23 +131,6 @@ class LeaseMachine(RuleBasedStateMachine):
         self.lease.release(person)
         if self.holder == person:
             self.holder = None
-
-    @rule(person=people)
-    def ask(self, person):
-        self._expire()
-        self.lease.ask(person)
-        self.asked.add(person)
-
-    @rule(person=people, to=people)
-    def hand_over(self, person, to):
-        self._expire()
-        if self.holder != person or to not in self.asked:
-            with pytest.raises(JobRejected if self.holder == person else LeaseHeld):
-                self.lease.hand_over(person, to.name, to.client)
-            return
-        self.lease.hand_over(person, to.name, to.client)
-        self.asked.clear()
-        self.holder, self.until = to, self.clock.now_ns() * 1e-9 + LEASE_S
 
     @rule(seconds=st.floats(0.1, 60))
     def wait(self, seconds):

@@ -28,7 +28,7 @@ def test_other_computers_need_a_token_and_its_role_decides(serve):
     served = serve(needs_login=True)
     client, tokens = served.client, served.server.sessions.tokens
     assert client.get(f"{API}/health").json()["status"] == "ok"
-    for path in ("status", "objects", "events", "live", "configuration", "log", "runs"):
+    for path in ("status", "objects", "events", "picture", "configuration", "log", "runs"):
         assert client.get(f"{API}/{path}").status_code == 401, path
     assert client.get("/metrics").status_code == 401
     watch = {"Authorization": f"Bearer {tokens.new('tablet', Role.WATCH)}"}
