@@ -27,10 +27,7 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
 
     A result that passed is in force for the next procedure. The first that does not pass ends the series.
 
-    Raises
-    ------
-    typer.Exit
-        With code 6 if a calibration did not pass.
+    Raises `typer.Exit`: with code 6 if a calibration did not pass.
     """
     from calibration.procedure import calibrated
     from rig.cli.ui.desk import CommandDesk

@@ -125,14 +125,9 @@ class Procedure(ABC):
     def measure(self, bench: Bench, *required: CalibrationResult) -> Measured:
         """Measure on the bench, and yield events and evaluations.
 
-        Raises
-        ------
-        UsageError
-            An option is out of range; before anything moves.
-        LimitExceeded
-            The cable leaves too little room; before anything moves.
-        ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-            See `rig.views.capture` and `rig.motion.turntable`.
+        Raises `UsageError`: an option is out of range; before anything moves. `LimitExceeded`: the cable leaves too
+        little room; before anything moves. `ViewRejected`, `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see
+        `rig.views.capture` and `rig.motion.turntable`.
         """
 
     def live(

@@ -77,10 +77,7 @@ def write_page(
     notes
         Further notes for the reader.
 
-    Raises
-    ------
-    UsageError
-        The file cannot be written.
+    Raises `UsageError`: the file cannot be written.
     """
     shown = [_shown(calibration, history) for calibration in calibrations]
     count = {status: sum(calibration.status is status for calibration in calibrations) for status in CalibrationStatus}

@@ -195,12 +195,8 @@ def open_sim_bench(
     name
         Name of the bench.
 
-    Raises
-    ------
-    ConfigError
-        The simulator has no servo of that model, or the model does not support the baud rate.
-    DeviceNotFound, DeviceMismatch, DeviceSilent
-        A simulated fault affects a device from the start.
+    Raises `ConfigError`: the simulator has no servo of that model, or the model does not support the baud rate.
+    `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: a simulated fault affects a device from the start.
     """
     world = operator.world
     config = config.model_copy(update={"servo": config.servo.model_copy(update={"write_settings": True})})

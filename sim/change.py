@@ -48,10 +48,7 @@ class Change:
     def named(cls, names: Iterable[str]) -> Self | None:
         """Return the combination of the named changes, or None if there are no names.
 
-        Raises
-        ------
-        UsageError
-            A name is unknown.
+        Raises `UsageError`: a name is unknown.
         """
         wanted = list(dict.fromkeys(names))
         for name in wanted:

@@ -21,10 +21,7 @@ def apply_results(config: RigConfig, results: Iterable[CalibrationResult]) -> tu
 
     A value in the configuration itself takes precedence over a result; a note reports each difference.
 
-    Raises
-    ------
-    ConfigError
-        A result sets a value that the configuration does not allow.
+    Raises `ConfigError`: a result sets a value that the configuration does not allow.
     """
     values = config.model_dump(exclude_unset=True)
     notes = []

@@ -68,10 +68,8 @@ class CalibrationResult:
     evidence
         The measurements, enough to fit them again.
 
-    Raises
-    ------
-    ValueError
-        A result without rejections has no estimate, one with rejections has settings, or ``when_utc`` has no time zone.
+    Raises `ValueError`: a result without rejections has no estimate, one with rejections has settings, or ``when_utc``
+    has no time zone.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -113,10 +111,7 @@ class CalibrationResult:
     def to_file(self, path: Path) -> None:
         """Write the result as JSON, completely or not at all.
 
-        Raises
-        ------
-        UsageError
-            The file cannot be written.
+        Raises `UsageError`: the file cannot be written.
         """
         step = "Give a file in an existing folder that you may write to."
         with os_errors_as(UsageError, f"Cannot write the calibration {path}.", next_step=step):
@@ -126,10 +121,7 @@ class CalibrationResult:
     def from_file(cls, path: Path) -> Self:
         """Read a result that `to_file` wrote.
 
-        Raises
-        ------
-        ConfigError
-            The file cannot be read, or is not a calibration result; the error lists all mistakes.
+        Raises `ConfigError`: the file cannot be read, or is not a calibration result; the error lists all mistakes.
         """
         try:
             result = _JSON.validate_json(read(path, max_bytes=MAX_FILE_BYTES))

@@ -80,10 +80,7 @@ class CalibrationStore:
     def add(self, result: CalibrationResult) -> Path:
         """Store a result, passed or not, and return its file.
 
-        Raises
-        ------
-        UsageError
-            The folder cannot be created or written to.
+        Raises `UsageError`: the folder cannot be created or written to.
         """
         step = "Set calibration_dir to a folder that you may write to."
         with os_errors_as(UsageError, f"Cannot store calibrations in {self.folder}.", next_step=step):

@@ -105,10 +105,7 @@ _ALSO_AT: Final = {
 def imu_kinds() -> dict[str, ImuKind]:
     """Return all rows by key; a row of another package replaces the row with the same key.
 
-    Raises
-    ------
-    ConfigError
-        A package's row cannot be loaded.
+    Raises `ConfigError`: a package's row cannot be loaded.
     """
     return _BUILT_IN | {row.key: row for _, row in plugins(GROUP)}
 
@@ -116,12 +113,7 @@ def imu_kinds() -> dict[str, ImuKind]:
 def imu_kind(key: str) -> ImuKind:
     """Return the row of a sensor that has a driver.
 
-    Raises
-    ------
-    ValueError
-        There is none.
-    ConfigError
-        A package's row cannot be loaded.
+    Raises `ValueError`: there is none. `ConfigError`: a package's row cannot be loaded.
     """
     row = _BUILT_IN.get(key)
     if row is None or not row.driver:

@@ -88,10 +88,8 @@ def statements(text: str) -> Iterator[Statement]:
 def loads(text: str) -> dict[str, Any]:
     """Return the values of a document.
 
-    Raises
-    ------
-    ValueError
-        It is not TOML, has an integer of more than 64 bits, or is nested too deeply. `tomllib.TOMLDecodeError` is one.
+    Raises `ValueError`: it is not TOML, has an integer of more than 64 bits, or is nested too deeply.
+    `tomllib.TOMLDecodeError` is one.
     """
     if any(line.count(".") > MAX_DOTS for line in text.splitlines()):
         raise ValueError("a key has too many parts")
@@ -118,10 +116,8 @@ def line_numbers(text: str) -> dict[Key, int]:
 def with_values(text: str, changes: Mapping[Key, Any]) -> str:
     """Return the document with some values set; values that do not change stay as they are written.
 
-    Raises
-    ------
-    ConfigError
-        The document is not TOML, or has a key in a form that cannot be edited without changing something else.
+    Raises `ConfigError`: the document is not TOML, or has a key in a form that cannot be edited without changing
+    something else.
     """
     try:
         before = loads(text)
@@ -159,10 +155,7 @@ def changed_lines(old: str, new: str) -> list[str]:
 def read_text(path: Path) -> str:
     """Return a configuration file's text with its own line ends.
 
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, or is not text.
+    Raises `ConfigError`: the file cannot be read, or is not text.
     """
     try:
         return read(path, max_bytes=MAX_FILE_BYTES).decode("utf-8")
@@ -177,10 +170,7 @@ def read_text(path: Path) -> str:
 def save(path: Path, text: str) -> None:
     """Write a configuration file completely or not at all; a symbolic link stays a link.
 
-    Raises
-    ------
-    ConfigError
-        The file cannot be written.
+    Raises `ConfigError`: the file cannot be written.
     """
     target = path.resolve()
     step = ("Give a file in a writable folder.", Do.RUN_AGAIN(config="FILE"))

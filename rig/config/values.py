@@ -57,10 +57,7 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, sear
 
     Without ``path`` it is the file in force, if any; with ``search`` false there is no file.
 
-    Raises
-    ------
-    ConfigError
-        The file is missing or is not TOML, or an override is invalid.
+    Raises `ConfigError`: the file is missing or is not TOML, or an override is invalid.
     """
     values: dict[str, Any] = {}
     places: dict[Key, str] = {}
@@ -156,10 +153,7 @@ def _apply(values: dict[str, Any], override: str) -> Key:
 def parsed(text: str) -> Any:
     """Return a typed value: parsed as TOML, or else as a bare word.
 
-    Raises
-    ------
-    ConfigError
-        The text has more than one line, or is too long, or its value is too large.
+    Raises `ConfigError`: the text has more than one line, or is too long, or its value is too large.
     """
     if len(text) > MAX_VALUE_LENGTH or len(text.strip().splitlines()) > 1:
         raise ConfigError(

@@ -37,10 +37,7 @@ class Cluster:
     def workers(self) -> int | None:
         """Return how many workers to start on this computer; None for a cluster that runs already.
 
-        Raises
-        ------
-        UsageError
-            The number is not valid.
+        Raises `UsageError`: the number is not valid.
         """
         name, _, count = self.address.partition(":")
         if name != LOCAL:
@@ -63,10 +60,7 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
     items
         Items that can be pickled.
 
-    Raises
-    ------
-    ClusterFailed
-        The cluster does not answer, or an item ended several workers.
+    Raises `ClusterFailed`: the cluster does not answer, or an item ended several workers.
     """
     todo = list(items)
     if not todo:

@@ -15,10 +15,7 @@ MAX_SINGLE_SYNCS: Final = 100
 def read(path: Path, *, max_bytes: int) -> bytes:
     """Return the content of a regular file; a pipe or a device is never waited for.
 
-    Raises
-    ------
-    OSError
-        The file is missing, cannot be read, is not a regular file, or is larger than ``max_bytes``.
+    Raises `OSError`: the file is missing, cannot be read, is not a regular file, or is larger than ``max_bytes``.
     """
     with open_regular(path) as file:
         content = file.read(max_bytes + 1)
@@ -41,10 +38,7 @@ def open_regular(path: Path) -> BinaryIO:
 def json_values(content: bytes | str) -> Any:
     """Return the values of a JSON document.
 
-    Raises
-    ------
-    ValueError
-        It is not JSON, is nested too deeply, or has a number that is not finite.
+    Raises `ValueError`: it is not JSON, is nested too deeply, or has a number that is not finite.
     """
     try:
         return json.loads(content, parse_constant=_reject_constant)

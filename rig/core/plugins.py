@@ -13,10 +13,7 @@ from rig.core.errors import ConfigError
 def plugins(group: str) -> Iterator[tuple[str, Any]]:
     """Yield the name and the object of each entry point of a group; looking them up takes about 10 ms.
 
-    Raises
-    ------
-    ConfigError
-        An object cannot be loaded.
+    Raises `ConfigError`: an object cannot be loaded.
     """
     for point in entry_points(group=group):
         try:

@@ -79,10 +79,7 @@ def scan_servos(
 
     Takes about one second per baud rate, four at 9,600 baud, and five with Protocol 1.0.
 
-    Raises
-    ------
-    serial.SerialException, OSError
-        The adapter was unplugged.
+    Raises `serial.SerialException`, `OSError`: the adapter was unplugged.
     """
     before = wire.baudrate
     try:
@@ -282,10 +279,7 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
 
     An address at which the bus fails is also returned, with the error's number: the others are asked nevertheless.
 
-    Raises
-    ------
-    OSError
-        The bus cannot be opened.
+    Raises `OSError`: the bus cannot be opened.
     """
     name = computer.i2c_name(bus)
     rows = imu_kinds().values()

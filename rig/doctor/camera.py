@@ -76,10 +76,7 @@ def open_camera(context: DoctorContext, *, refocus: bool = False) -> OpenCvCamer
 
     With ``refocus`` the autofocus finds a new position, which is stored for later programs.
 
-    Raises
-    ------
-    DeviceNotFound, DeviceSilent
-        The camera is missing, or delivers no frames.
+    Raises `DeviceNotFound`, `DeviceSilent`: the camera is missing, or delivers no frames.
     """
     source = context.config.camera.source
     capture = context.computer.open_capture(source)

@@ -66,10 +66,7 @@ def open_context(
 
     ``is_held`` says that this program holds the bench, and has closed its devices.
 
-    Raises
-    ------
-    ConfigError
-        There is no such bench, or its options have mistakes.
+    Raises `ConfigError`: there is no such bench, or its options have mistakes.
     """
     kind = bench_kind(bench)
     chosen = validate(kind.options, config.bench.get(bench, {}), where="the configuration", prefix=f"bench.{bench}")

@@ -22,14 +22,8 @@ _SETTLE_S = 0.05  # time that a servo needs before it answers at a new rate
 class SingleServo:
     """The only servo on a bus, found at any id and baud rate.
 
-    Raises
-    ------
-    DeviceNotFound
-        No servo answers at any baud rate.
-    SeveralServos
-        Several servos answer, or two have the same id.
-    DeviceMismatch
-        The rig cannot drive its model.
+    Raises `DeviceNotFound`: no servo answers at any baud rate. `SeveralServos`: several servos answer, or two have the
+    same id. `DeviceMismatch`: the rig cannot drive its model.
     """
 
     def __init__(
@@ -55,12 +49,8 @@ class SingleServo:
     def set_id(self, new: int) -> None:
         """Change the id of the servo.
 
-        Raises
-        ------
-        UsageError
-            The id is out of range.
-        RequestRejected
-            The servo did not accept the id; it answers to the old one.
+        Raises `UsageError`: the id is out of range. `RequestRejected`: the servo did not accept the id; it answers to
+        the old one.
         """
         if not 0 <= new <= MAX_ID:
             raise UsageError(f"No servo has the id {new}.", next_step=f"Choose an id from 0 to {MAX_ID}.")
@@ -73,12 +63,8 @@ class SingleServo:
     def set_baud(self, rate: int) -> None:
         """Change the baud rate of the servo and of the port.
 
-        Raises
-        ------
-        UsageError
-            The model or the adapter does not support the rate.
-        RequestRejected
-            The servo did not accept the rate; it answers at the old one.
+        Raises `UsageError`: the model or the adapter does not support the rate. `RequestRejected`: the servo did not
+        accept the rate; it answers at the old one.
         """
         codes = baud_codes(self.table)
         if rate not in codes:

@@ -35,10 +35,7 @@ def load_experiment(name: str, **changed: Any) -> Experiment:
     A key is an attribute of `Experiment`, `Condition` or `Protocol`. The key ``base`` names a shipped experiment whose
     keys hold, too. The key ``orientation_errors`` names a file for `rotation_errors`.
 
-    Raises
-    ------
-    ValueError
-        There is no such experiment, or a key or value is wrong.
+    Raises `ValueError`: there is no such experiment, or a key or value is wrong.
     """
     known = shipped()
     if name in known:
@@ -82,10 +79,7 @@ def rotation_errors(name: str) -> tuple[float, ...]:
     They come from a stored result of ``rig calibrate imu`` (the gyro's rotation minus the encoder's, of each move), or
     from a JSON file with ``rotation_errors_deg``; "mpu6050" names the shipped one.
 
-    Raises
-    ------
-    ValueError
-        The file cannot be read, or it has no such errors.
+    Raises `ValueError`: the file cannot be read, or it has no such errors.
     """
     path = Path(str(files("rig.evaluation").joinpath("mpu6050.json"))) if name == "mpu6050" else Path(name)
     try:
@@ -129,10 +123,7 @@ def _range(text: str) -> tuple[int, int]:
 def load_catalog(catalog: Catalog) -> Dataset:
     """Return the stored images of a catalog as a data set, each with the part that searches use.
 
-    Raises
-    ------
-    DatasetError
-        There are fewer than two objects, or two views of an object from the same angle.
+    Raises `DatasetError`: there are fewer than two objects, or two views of an object from the same angle.
     """
     objects = []
     for summary in catalog.objects():

@@ -43,10 +43,8 @@ def run_experiment(
 
     `advance` is called with "described" and "searched" and the name of each object.
 
-    Raises
-    ------
-    DatasetError, ValueError
-        A photograph cannot be used, or there are too few objects or views for the experiment.
+    Raises `DatasetError`, `ValueError`: a photograph cannot be used, or there are too few objects or views for the
+    experiment.
     """
     kind, dataset = _KINDS[experiment.kind], dataset.every(experiment.every)
 
@@ -75,10 +73,7 @@ def own_folder(experiment: Experiment, dataset: Dataset) -> Path:
 def write_results(results: Mapping[str, Any], folder: Path) -> None:
     """Write results.json, results.csv and the figures; a missing folder is created.
 
-    Raises
-    ------
-    UsageError
-        The folder cannot be written.
+    Raises `UsageError`: the folder cannot be written.
     """
     text = io.StringIO()
     rows = rows_of(results)

@@ -598,10 +598,7 @@ def event_dict(event: Event) -> dict[str, Any]:
 def event_of(values: Mapping[str, Any]) -> Event:
     """Return the event of JSON values from `event_dict`; its images are empty. Unknown fields are left out.
 
-    Raises
-    ------
-    ValueError
-        The values are not an event; the text names the field.
+    Raises `ValueError`: the values are not an event; the text names the field.
     """
     try:
         return _adapter().validate_json(to_json(values), strict=True)

@@ -33,12 +33,8 @@ def enroll(
     ``ask`` says whether the operator may be asked for a new empty-table image; the rest is as for
     `rig.plans.enroll.enroll`.
 
-    Raises
-    ------
-    ObjectExists, CatalogError, CatalogBusy
-        The name cannot be enrolled; nothing has moved.
-    RigError
-        As in `rig.plans.enroll.enroll`.
+    Raises `ObjectExists`, `CatalogError`, `CatalogBusy`: the name cannot be enrolled; nothing has moved. `RigError`: as
+    in `rig.plans.enroll.enroll`.
     """
     with desk.open_bench() as bench, desk.open_to_enroll(bench.clock) as catalog:
         catalog.check_enrollable(name, label=label, note=note, resume=resume, replace=replace)

@@ -57,12 +57,8 @@ def identify(
     next_folder
         Returns the folder of the next saved run; None saves nothing.
 
-    Raises
-    ------
-    UsageError
-        The sample cannot be recorded, or there is no such strategy.
-    RigError
-        As in `rig.plans.identify.identify` and `rig.search.model.load_model`.
+    Raises `UsageError`: the sample cannot be recorded, or there is no such strategy. `RigError`: as in
+    `rig.plans.identify.identify` and `rig.search.model.load_model`.
     """
     config = desk.config.identify
     sample = _checked(sample, scan=scan, watch=watch, records=config.record != "none")

@@ -34,10 +34,8 @@ def bench_report(
     open_parts
         Opens its other devices, if the servo does not work.
 
-    Raises
-    ------
-    RigError
-        The server does not answer, or the bench cannot be opened for another reason than a missing servo.
+    Raises `RigError`: the server does not answer, or the bench cannot be opened for another reason than a missing
+    servo.
     """
     if server := server_address(state_path):
         return _report_of_server(server)

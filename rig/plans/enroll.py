@@ -348,21 +348,12 @@ def enroll(
     (`rig.plans.photograph_table`); the enrollment stores it. At the end all views are segmented and described together
     (`OpenEnrollment.finish`).
 
-    Raises
-    ------
-    ObjectExists, CatalogError, CatalogBusy
-        See `Catalog.begin` and `Catalog.resume`.
-    CameraSettingsDiffer
-        The camera has other settings than at the views to continue.
-    RotationDisagreement
-        Encoder and gyro differ by more than their uncertainty, or the gyro has no value: no view is stored at an
-        uncertain angle.
-    NoObject
-        The first view shows the empty table: nothing is stored.
-    ObjectMoved
-        The object is not where it was for the first view of this session: the enrollment is abandoned.
-    ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.views.capture` and `rig.motion.turntable`; the views stored so far stay.
+    Raises `ObjectExists`, `CatalogError`, `CatalogBusy`: see `Catalog.begin` and `Catalog.resume`.
+    `CameraSettingsDiffer`: the camera has other settings than at the views to continue. `RotationDisagreement`: encoder
+    and gyro differ by more than their uncertainty, or the gyro has no value: no view is stored at an uncertain angle.
+    `NoObject`: the first view shows the empty table: nothing is stored. `ObjectMoved`: the object is not where it was
+    for the first view of this session: the enrollment is abandoned. `ViewRejected`, `LimitExceeded`, `MotionTimeout`,
+    `DeviceFault`, `DeviceSilent`: see `rig.views.capture` and `rig.motion.turntable`; the views stored so far stay.
     """
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     in_motion = takes_in_motion(bench.config, fly)

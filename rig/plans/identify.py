@@ -319,18 +319,10 @@ def identify(
         Called with the event of each frame of a search in motion while the table rotates; the plan yields these events
         when it has stopped. It must return at once.
 
-    Raises
-    ------
-    CatalogError
-        Nothing is enrolled.
-    CameraSettingsDiffer
-        All objects were enrolled with other settings of the camera.
-    UsageError
-        There is no such strategy, or the model is not for it.
-    NoObject
-        The first view shows the empty table.
-    ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.views.capture` and `rig.motion.turntable`.
+    Raises `CatalogError`: nothing is enrolled. `CameraSettingsDiffer`: all objects were enrolled with other settings of
+    the camera. `UsageError`: there is no such strategy, or the model is not for it. `NoObject`: the first view shows
+    the empty table. `ViewRejected`, `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see `rig.views.capture` and
+    `rig.motion.turntable`.
     """
     config = config or bench.config
     if strategy is None and _flies(config, model):
@@ -462,10 +454,7 @@ def watch(
         Begins `identify` for the next object, with a model of what is enrolled then. Its placer brings the objects,
         or waits for them.
 
-    Raises
-    ------
-    RigError
-        As `identify`, except for `NoObject` and `ViewRejected`.
+    Raises `RigError`: as `identify`, except for `NoObject` and `ViewRejected`.
     """
     with Turntable(bench) as table:
         home_deg = table.rest_deg

@@ -65,16 +65,10 @@ def photograph_table(
     views
         The number of images in a revolution of the camera.
 
-    Raises
-    ------
-    TableNotEmpty
-        Something rotates with the table, or the surroundings moved. The previous images stay.
-    UsageError
-        The object cannot be removed, or the images together are too large.
-    StateNotStored
-        The images cannot be stored.
-    ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.views.capture` and `rig.motion.turntable`.
+    Raises `TableNotEmpty`: something rotates with the table, or the surroundings moved. The previous images stay.
+    `UsageError`: the object cannot be removed, or the images together are too large. `StateNotStored`: the images
+    cannot be stored. `ViewRejected`, `LimitExceeded`, `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see
+    `rig.views.capture` and `rig.motion.turntable`.
     """
     if bench.placer is not None and not bench.placer.clear():
         raise UsageError(

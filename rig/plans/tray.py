@@ -132,10 +132,7 @@ def enroll_tray(
         Whether the views are taken in motion. The default is ``enroll.mode``; "auto" means in motion if the camera's
         time is calibrated and the cable budget allows a revolution.
 
-    Raises
-    ------
-    RigError
-        As in `enroll`, if the operator decides to stop.
+    Raises `RigError`: as in `enroll`, if the operator decides to stop.
     """
     operator = operator or Unattended()
     for number, item in enumerate(items, 1):

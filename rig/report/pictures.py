@@ -41,10 +41,7 @@ def thumbnail(
     -------
     uint8 (height, width, 3) BGR, a new array.
 
-    Raises
-    ------
-    ValueError
-        The region contains no part of the image.
+    Raises `ValueError`: the region contains no part of the image.
     """
     if region is not None:
         x, y, w, h = region

@@ -120,10 +120,7 @@ def render_report(
 def run_report(saved: SavedRun) -> str:
     """Return the page about a saved run: the answer, the camera's path, the candidates and the decisions.
 
-    Raises
-    ------
-    UsageError
-        The run is damaged.
+    Raises `UsageError`: the run is damaged.
     """
     record = IdentificationRecord(region=saved.config.view.roi)
     about = saved.about
@@ -143,10 +140,7 @@ def run_report(saved: SavedRun) -> str:
 def write_report(path: Path, html: str) -> None:
     """Write the page to ``path`` completely or not at all; create missing folders.
 
-    Raises
-    ------
-    UsageError
-        The file cannot be written there.
+    Raises `UsageError`: the file cannot be written there.
     """
     step = ("Choose a folder that you may write to, on a disk with free space.", Do.RUN_AGAIN(out="FILE"))
     with os_errors_as(UsageError, f"The report cannot be written to {path}.", next_step=step):

@@ -133,12 +133,8 @@ def load_model(
     ``descriptor`` is another one, for a strategy of the paper. ``progress`` is called while the program describes views
     that have no description by it.
 
-    Raises
-    ------
-    UsageError
-        There is no such descriptor.
-    CatalogError, CatalogBusy
-        The catalog cannot be read, or a view cannot be described.
+    Raises `UsageError`: there is no such descriptor. `CatalogError`, `CatalogBusy`: the catalog cannot be read, or a
+    view cannot be described.
     """
     views = derived.views(catalog, descriptor or BENCH_DESCRIPTOR, progress)
     copied = catalog.copied_utc

@@ -90,12 +90,8 @@ class Tokens:
     def new(self, name: str, role: Role, days: float | None = None) -> str:
         """Make a token, store its hash, and return it; a token of the same name is replaced.
 
-        Raises
-        ------
-        ConfigError
-            The name cannot be used, or the file is damaged.
-        StateNotStored
-            The file cannot be written.
+        Raises `ConfigError`: the name cannot be used, or the file is damaged. `StateNotStored`: the file cannot be
+        written.
         """
         if not 0 < len(name) <= MAX_NAME or not name.isprintable() or name.strip() != name or name.casefold() == LOCAL:
             raise ConfigError(
@@ -126,10 +122,7 @@ class Tokens:
     def valid(self, sha256: str) -> StoredToken | None:
         """Return the token with this hash; None if it is unknown or has expired.
 
-        Raises
-        ------
-        ConfigError
-            The file is damaged, and the token is not one of the last good ones.
+        Raises `ConfigError`: the file is damaged, and the token is not one of the last good ones.
         """
         self._read()
         found = next((stored for stored in self._known if hmac.compare_digest(sha256, stored.sha256)), None)
@@ -199,12 +192,7 @@ class Sessions:
 
         Wrong tokens lock no one out: a token cannot be guessed, and its owner may have to stop the table.
 
-        Raises
-        ------
-        LoginRequired
-            The token is unknown or has expired.
-        ConfigError
-            The file of the tokens is damaged.
+        Raises `LoginRequired`: the token is unknown or has expired. `ConfigError`: the file of the tokens is damaged.
         """
         if hmac.compare_digest(token.encode(errors="replace"), self.local_token.encode()):
             return StoredToken(name=LOCAL, role=Role.WATCH, sha256=_hash(token), created_utc=self.clock.utc())
@@ -252,10 +240,7 @@ class Lease:
     def take(self, person: Person, *, force: bool = False) -> None:
         """Take or renew the lease; with ``force`` also from another operator, who is warned.
 
-        Raises
-        ------
-        LeaseHeld
-            Another operator has it.
+        Raises `LeaseHeld`: another operator has it.
         """
         with self._lock:
             before, renewed = self.holder, self.is_held_by(person)

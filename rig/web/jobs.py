@@ -71,10 +71,7 @@ class JobQueue:
     def submit(self, request: JobRequest, operator: str) -> Job:
         """Add a job to the queue and return it.
 
-        Raises
-        ------
-        JobRejected
-            Too many jobs wait, or too large ones.
+        Raises `JobRejected`: too many jobs wait, or too large ones.
         """
         with self._lock:
             self.heed_stops()

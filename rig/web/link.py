@@ -62,10 +62,7 @@ class Link:
     def call(self, name: str, **values: Any) -> tuple[Any, bytes]:
         """Call a function at the other end and return its result and content; its errors are raised here.
 
-        Raises
-        ------
-        BenchBusy
-            There is no answer in time.
+        Raises `BenchBusy`: there is no answer in time.
         """
         number, future = next(self._numbers), Future[tuple[Any, bytes]]()
         self._waiting[number] = future

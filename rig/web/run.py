@@ -53,14 +53,8 @@ def run_server(setup: Setup, ready: Callable[[str], None]) -> None:
 
     ``ready`` gets the address of the page when the server answers.
 
-    Raises
-    ------
-    UsageError
-        The address or the certificate cannot be used.
-    BenchBusy
-        Another server uses the bench.
-    WebEnded
-        The web process ends again and again.
+    Raises `UsageError`: the address or the certificate cannot be used. `BenchBusy`: another server uses the bench.
+    `WebEnded`: the web process ends again and again.
     """
     clock, listening = SystemClock(), setup.listening
     _check_certificate(listening)

@@ -44,12 +44,7 @@ class Server:
     def person(self, request: HTTPConnection) -> Person | None:
         """Return the sender of a request; None if it is not known.
 
-        Raises
-        ------
-        LoginRequired
-            Its token is wrong.
-        ConfigError
-            The file of the tokens is damaged.
+        Raises `LoginRequired`: its token is wrong. `ConfigError`: the file of the tokens is damaged.
         """
         # A browser cannot set headers of a web socket, so its page sends the client in the address.
         client = (request.headers.get("x-rig-client") or request.query_params.get("client", ""))[:64]

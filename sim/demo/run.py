@@ -150,12 +150,8 @@ def run_demo(
     changed (``change``) after the enrollments. Without ``empty_table`` no empty-table image is taken. The ``faults``
     and those of the configuration are injected meanwhile.
 
-    Raises
-    ------
-    UsageError
-        There are fewer objects than ``count``, ``out`` is not writable, or photographs cannot show the ``change``.
-    ConfigError
-        The options of the simulated bench have mistakes, or there are no photographs.
+    Raises `UsageError`: there are fewer objects than ``count``, ``out`` is not writable, or photographs cannot show the
+    ``change``. `ConfigError`: the options of the simulated bench have mistakes, or there are no photographs.
     """
     if settings.bench not in (None, "sim"):
         raise UsageError(

@@ -23,10 +23,7 @@ def fault_kinds() -> Mapping[str, FaultKind]:
 def find_fault(name: str) -> FaultKind:
     """Return the kind called ``name``.
 
-    Raises
-    ------
-    UsageError
-        No kind has that name; the next step names the most similar ones.
+    Raises `UsageError`: no kind has that name; the next step names the most similar ones.
     """
     if name in fault_kinds():
         return fault_kinds()[name]

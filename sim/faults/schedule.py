@@ -122,10 +122,7 @@ class Fault:
 def load_faults(path: Path) -> list[Fault]:
     """Return the faults of a TOML file: ``faults = ["jam@move3+2s", ...]``, or tables ``[[faults]]``.
 
-    Raises
-    ------
-    UsageError
-        The file or one of its faults cannot be read; the message says which one.
+    Raises `UsageError`: the file or one of its faults cannot be read; the message says which one.
     """
     try:
         with os_errors_as(UsageError, f"Cannot read the faults in {path}.", next_step="Give an existing file."):

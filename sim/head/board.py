@@ -104,10 +104,7 @@ class SimHead:
     listeners
         Called with each `PinChange`.
 
-    Raises
-    ------
-    ConfigError
-        The firmware cannot be built on this computer.
+    Raises `ConfigError`: the firmware cannot be built on this computer.
     """
 
     path = ""

@@ -14,10 +14,7 @@ class HeadSerial:
     ``timeout`` is in seconds. After the head is unplugged, every call fails. When it is plugged in again, a new port
     must be opened.
 
-    Raises
-    ------
-    serial.SerialException
-        Another port is open on this head.
+    Raises `serial.SerialException`: another port is open on this head.
     """
 
     def __init__(self, head: SimHead) -> None:

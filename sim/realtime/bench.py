@@ -82,12 +82,8 @@ class RunningSimBench(HardwareBench):
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:  # noqa: ARG002
         """Yield the computer of the simulated bench.
 
-        Raises
-        ------
-        DeviceNotFound
-            The bench is not running.
-        ConfigError
-            The configuration is not the one in the bench's folder. It could name the port of a real servo.
+        Raises `DeviceNotFound`: the bench is not running. `ConfigError`: the configuration is not the one in the
+        bench's folder. It could name the port of a real servo.
         """
         assert isinstance(options, SimBenchOptions)
         folder = options.folder.absolute()

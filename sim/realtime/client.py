@@ -18,10 +18,7 @@ from sim.realtime.wire import Wire
 class RemoteCapture:
     """The simulated bench's camera; behaves like `cv2.VideoCapture`.
 
-    Raises
-    ------
-    DeviceNotFound
-        The simulated bench is not running, its camera is unplugged, or another program uses it.
+    Raises `DeviceNotFound`: the simulated bench is not running, its camera is unplugged, or another program uses it.
     """
 
     def __init__(self, folder: Path) -> None:

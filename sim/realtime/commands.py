@@ -58,10 +58,7 @@ class Commands:
     def do(self, words: Sequence[str]) -> str:
         """Carry out a command, and return the result in words.
 
-        Raises
-        ------
-        UsageError, ObjectNotFound
-            There is no such command, object or fault, or it is not possible now.
+        Raises `UsageError`, `ObjectNotFound`: there is no such command, object or fault, or it is not possible now.
         """
         command, *given = words or ["help"]
         match command:

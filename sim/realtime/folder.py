@@ -27,12 +27,8 @@ def reserve(folder: Path | None, ends: ExitStack) -> Path:
 
     Without a ``folder`` it is `DEFAULT_FOLDER`, or the first of those with a number that no program uses.
 
-    Raises
-    ------
-    BenchBusy
-        Another program runs the bench in this folder.
-    UsageError
-        The folder cannot be written, or holds other files.
+    Raises `BenchBusy`: another program runs the bench in this folder. `UsageError`: the folder cannot be written, or
+    holds other files.
     """
     if folder is None:
         names = (DEFAULT_FOLDER.with_name(f"{DEFAULT_FOLDER}-{n}") for n in count(2))
@@ -66,10 +62,7 @@ def configure(folder: Path, settings: Settings) -> tuple[RigConfig, SimOptions]:
     Its settings are those of the file there, else those of the configuration in force. ``--config`` and ``--set`` of
     the command line replace them.
 
-    Raises
-    ------
-    ConfigError
-        The configuration has mistakes.
+    Raises `ConfigError`: the configuration has mistakes.
     """
     path = folder / CONFIG
     source = settings.config or (path if path.exists() else default_path())

@@ -31,12 +31,7 @@ class PtyPort:
     sent
         Number of bytes that other programs were sent.
 
-    Raises
-    ------
-    DeviceNotFound
-        The device is unplugged.
-    OSError
-        The link cannot be created.
+    Raises `DeviceNotFound`: the device is unplugged. `OSError`: the link cannot be created.
     """
 
     def __init__(self, open_connection: Callable[[], SerialConnection], link: Path | None = None) -> None:

@@ -32,10 +32,7 @@ from sim.servo.base import BOOT_S
 def run_bench(settings: Settings, folder: Path | None, seconds: float | None) -> None:
     """Run a bench in a folder until it is ended.
 
-    Raises
-    ------
-    BenchBusy, UsageError, ConfigError
-        See `sim.realtime.folder`.
+    Raises `BenchBusy`, `UsageError`, `ConfigError`: see `sim.realtime.folder`.
     """
     with ExitStack() as ends:
         # The world, as `rig.bench` finds it: the servo is configured, and the table is where it was left.

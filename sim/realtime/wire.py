@@ -25,10 +25,7 @@ PATIENCE_S: Final = 15.0
 class Wire:
     """A connection to the simulated bench in ``folder``.
 
-    Raises
-    ------
-    DeviceNotFound
-        The simulated bench is not running.
+    Raises `DeviceNotFound`: the simulated bench is not running.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -63,12 +60,8 @@ class Wire:
 def send_command(folder: Path, *words: str) -> dict[str, Any]:
     """Send a command to the running bench in ``folder``; return its answer and the state of its world.
 
-    Raises
-    ------
-    DeviceNotFound
-        No simulated bench is running in the folder.
-    UsageError
-        There is no such command, or it is not possible now.
+    Raises `DeviceNotFound`: no simulated bench is running in the folder. `UsageError`: there is no such command, or it
+    is not possible now.
     """
     wire = Wire(folder)
     try:

@@ -164,10 +164,7 @@ class Ax12Servo(SimulatedServoBase):
     center_counts
         The position reading at the shaft's angle 0.
 
-    Raises
-    ------
-    ValueError
-        There is no such id or baud rate.
+    Raises `ValueError`: there is no such id or baud rate.
     """
 
     protocol = 1

@@ -105,10 +105,7 @@ class Memory:
     def read(self, address: int, size: int) -> bytes:
         """Return ``size`` bytes from ``address``; addresses between the registers read as 0, as on the device.
 
-        Raises
-        ------
-        Rejection
-            DATA_LENGTH for no bytes, ACCESS if the range exceeds the table.
+        Raises `Rejection`: DATA_LENGTH for no bytes, ACCESS if the range exceeds the table.
         """
         if size == 0:
             raise InstructionRejected(StatusError.DATA_LENGTH)
@@ -122,11 +119,8 @@ class Memory:
     def entries(self, address: int, data: bytes) -> list[tuple[Register, int]]:
         """Return the registers that a write of ``data`` to ``address`` sets, with values checked against their ranges.
 
-        Raises
-        ------
-        Rejection
-            ACCESS for a read-only register or an address without a register, DATA_LENGTH for a part of a register,
-            DATA_RANGE for a value outside its range.
+        Raises `Rejection`: ACCESS for a read-only register or an address without a register, DATA_LENGTH for a part of
+        a register, DATA_RANGE for a value outside its range.
         """
         if not data:
             raise InstructionRejected(StatusError.DATA_LENGTH)

@@ -39,10 +39,7 @@ class XSeriesServo(SimulatedServoBase):
     center_counts
         The encoder's reading at the shaft's angle 0; default: the middle of its revolution.
 
-    Raises
-    ------
-    ValueError
-        There is no such model, id or baud rate.
+    Raises `ValueError`: there is no such model, id or baud rate.
     """
 
     protocol = 2

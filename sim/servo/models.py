@@ -224,10 +224,7 @@ MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model
 def servo_model(name: str) -> ServoModel:
     """Return the simulated model of that name, which a package may add by an entry point of the group `GROUP`.
 
-    Raises
-    ------
-    ValueError
-        There is none.
+    Raises `ValueError`: there is none.
     """
     model = MODELS.get(name) or dict(plugins(GROUP)).get(name)
     if model is not None:

@@ -20,10 +20,7 @@ class SimSerial:
     port
         The port's name in messages.
 
-    Raises
-    ------
-    serial.SerialException
-        The bus already has a host.
+    Raises `serial.SerialException`: the bus already has a host.
     """
 
     def __init__(self, bus: ServoBus, baudrate: int = 57_600, timeout: float | None = None, port: str = "sim") -> None:
@@ -78,12 +75,8 @@ class SimSerial:
     def read(self, size: int = 1) -> bytes:
         """Return up to ``size`` bytes: all as soon as they have arrived, fewer at the timeout.
 
-        Raises
-        ------
-        serial.SerialException
-            The port is closed or unplugged.
-        RuntimeError
-            There is no timeout, and no scheduled event can deliver the missing bytes.
+        Raises `serial.SerialException`: the port is closed or unplugged. `RuntimeError`: there is no timeout, and no
+        scheduled event can deliver the missing bytes.
         """
         self._require_open()
         clock = self._bus.clock

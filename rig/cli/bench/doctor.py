@@ -194,12 +194,8 @@ def show_progress(text: str) -> None:
 def take(settings: Settings, *, refocus: bool = False) -> "tuple[Frame, CameraIdentity, CameraLocks]":
     """Return a frame of the configured camera, the camera, and its settings; with ``refocus`` the focus is new.
 
-    Raises
-    ------
-    BenchBusy
-        Another program uses the bench.
-    DeviceNotFound, DeviceSilent
-        The camera is missing, or delivers no frames.
+    Raises `BenchBusy`: another program uses the bench. `DeviceNotFound`, `DeviceSilent`: the camera is missing, or
+    delivers no frames.
     """
     from rig.doctor.camera import open_camera
 

@@ -94,10 +94,7 @@ def show_parameters(command: Callable[..., Any], parameters: Sequence[inspect.Pa
 def jobs_of(jobs: int | None, cluster: str | None) -> "Jobs | None":
     """Return where the work is done.
 
-    Raises
-    ------
-    UsageError
-        Both are given.
+    Raises `UsageError`: both are given.
     """
     from rig.core.cluster import Cluster
 

@@ -79,10 +79,7 @@ def ask_sample() -> str | None:
 def read_answer(question: str) -> str | None:
     """Print a question on stderr and return the line that answers it; None if standard input has ended.
 
-    Raises
-    ------
-    UsageError
-        Standard input cannot be read.
+    Raises `UsageError`: standard input cannot be read.
     """
     print(question, end=" ", file=sys.stderr, flush=True)
     try:
@@ -125,10 +122,7 @@ def is_interactive() -> bool:
 def confirm(question: str, *, yes: bool, settings: Settings) -> None:
     """Ask before a deletion.
 
-    Raises
-    ------
-    UsageError
-        There is no terminal to ask on, and ``yes`` is not set.
+    Raises `UsageError`: there is no terminal to ask on, and ``yes`` is not set.
     """
     if yes:
         return
