@@ -95,12 +95,7 @@ class Backlash(Procedure):
 def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     """Fit backlash and ratio to ``legs``.
 
-    Parameters
-    ----------
-    legs
-        Alternately up and down, of more than one length.
-    resolution_deg
-        Angle of one encoder count.
+    ``legs`` go alternately up and down, by more than one length. ``resolution_deg`` is the angle of one encoder count.
     """
     found = Evaluation(name=NAME, residual_unit="°", evidence={"legs": plain(list(legs))})
     used = [leg for leg in legs if not leg.invalid]

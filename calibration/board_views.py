@@ -116,12 +116,8 @@ def reject_loose_board(
 ) -> None:
     """Reject views between which board and encoder rotated by different angles.
 
-    Parameters
-    ----------
-    views
-        In the order in which they were taken.
-    poses
-        Rotation vector and translation of the board in the camera's frame, for each view.
+    ``views`` are in the order in which they were taken; ``poses`` are rotation vector and translation of the board in
+    the camera's frame, for each view.
     """
     worst = 0.0
     for (a, (rotation_a, _)), (b, (rotation_b, _)) in zip(

@@ -159,10 +159,7 @@ def allan(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return τ (s), the overlapping Allan deviation, and its degrees of freedom, over octaves of τ.
 
-    Parameters
-    ----------
-    rate
-        Float64 (n,), evenly spaced by ``period_s``.
+    ``rate``, float64 (n,), is evenly spaced by ``period_s``.
     """
     angle = np.concatenate([[0.0], np.cumsum(rate)]) * period_s
     spans = 2 ** np.arange(int(np.log2(rate.size / 4)) + 1)

@@ -107,12 +107,7 @@ class GyroRotation(Procedure):
 def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
     """Compare the scatter of ``moves`` at each speed with the stated uncertainty.
 
-    Parameters
-    ----------
-    moves
-        Rotations back and forth between the same rests.
-    resolution_deg
-        Angle of one encoder count.
+    ``moves`` go back and forth between the same rests. ``resolution_deg`` is the angle of one encoder count.
     """
     found = Evaluation(name=NAME, residual_unit="of the stated σ")
     rows: list[dict[str, Any]] = []

@@ -102,12 +102,8 @@ class GyroScale(Procedure):
 def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     """Fit the scale to ``legs``.
 
-    Parameters
-    ----------
-    legs
-        Whole revolutions, alternately up and down; each begins at the rest where the previous one ended.
-    resolution_deg
-        Angle of one encoder count: a rest lies anywhere within it.
+    ``legs`` are whole revolutions, alternately up and down; each begins at the rest where the previous one ended. A
+    rest lies anywhere within ``resolution_deg``, the angle of one encoder count.
     """
     found = Evaluation(name=NAME, residual_unit="°", evidence={"legs": plain(list(legs))})
     used = [leg for leg in legs if not leg.invalid]

@@ -119,12 +119,8 @@ class ImuMounting(Procedure):
 def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *, column: int, sign: int) -> Evaluation:
     """Evaluate the tilt, the levels and the delay.
 
-    Parameters
-    ----------
-    moves, levels
-        The measurements over a whole revolution.
-    column, sign
-        The sensor's axis that is along the table's axis, and +1 if it points up.
+    ``moves`` and ``levels`` are the measurements over a whole revolution. ``column`` and ``sign`` are the sensor's axis
+    that is along the table's axis, and +1 if it points up.
     """
     found = Evaluation(name=NAME, residual_unit="° of tilt")
     found.evidence = {

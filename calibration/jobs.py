@@ -42,13 +42,9 @@ LensMm = Annotated[
 class Calibration:
     """Procedures that run one after the other.
 
-    Attributes
-    ----------
-    title
-        Its name on a page, with what it needs; empty if only a terminal offers it.
-    procedures
-        Returns the procedures. Its parameters are the options of the command, its docstring is the command's help. A
-        parameter without a default is the name of an object.
+    ``title`` is its name on a page, with what it needs; empty if only a terminal offers it. ``procedures`` returns the
+    procedures: its parameters are the options of the command, its docstring is the command's help. A parameter without
+    a default is the name of an object.
     """
 
     title: str

@@ -68,14 +68,8 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
     A rest lies anywhere within an encoder count. Consecutive legs share a rest with opposite signs, so their errors are
     correlated. The uncertainties combine the stated noise with the scatter of the legs: see `scatter`.
 
-    Parameters
-    ----------
-    legs
-        Each begins at the rest where the previous one ended.
-    design
-        Float64 (n, p): each leg's rotation by the encoder per unit of each parameter.
-    resolution_deg
-        Angle of one encoder count.
+    Each leg begins at the rest where the previous one ended. ``design``, float64 (n, p), is each leg's rotation by the
+    encoder per unit of each parameter. ``resolution_deg`` is the angle of one encoder count.
     """
     n, parameters = design.shape
     count = resolution_deg**2 / 12

@@ -248,14 +248,7 @@ def open_sim_bench(
 class Stage(NamedTuple):
     """A simulated bench before it is opened.
 
-    Attributes
-    ----------
-    config
-        Its configuration.
-    operator
-        Returns the operator in a world.
-    findings
-        Notes for the operator.
+    ``operator`` returns the operator in a world, and ``findings`` are notes for the operator.
     """
 
     config: RigConfig

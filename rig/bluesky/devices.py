@@ -41,17 +41,8 @@ class WorkStatus:
 class BenchDevices(AbstractContextManager["BenchDevices"]):
     """An open bench with its devices for a RunEngine; the torque is on in the ``with`` block if ``hold`` is set.
 
-    Parameters
-    ----------
-    bench
-        An open bench. No other thread may use it.
-    hold
-        Whether to prepare the table at the start. `table` needs it; `enroll` and `identify` prepare it themselves.
-
-    Attributes
-    ----------
-    table, camera, imu
-        The devices.
+    ``hold`` prepares the table at the start: `table` needs it; `enroll` and `identify` prepare it themselves. No other
+    thread may use the bench.
     """
 
     def __init__(self, bench: Bench, *, hold: bool = True) -> None:

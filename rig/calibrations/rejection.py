@@ -264,10 +264,7 @@ def _known(code: RejectionCode | str) -> RejectionCode:
 class CalibrationRejection:
     """One reason why a calibration did not pass.
 
-    Attributes
-    ----------
-    values
-        The numbers that the words of ``code`` need, units in the keys.
+    ``values`` are the numbers that the words of ``code`` need, units in the keys.
     """
 
     code: Annotated[RejectionCode, BeforeValidator(_known), PlainSerializer(lambda code: code.name.lower())]

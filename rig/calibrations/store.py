@@ -67,10 +67,7 @@ class BenchCalibration:
 class CalibrationStore:
     """The folder of a bench's calibration results; the first `add` creates it.
 
-    Attributes
-    ----------
-    unreadable
-        Errors of the files that the last `history` left out.
+    ``unreadable`` are the errors of the files that the last `history` left out.
     """
 
     def __init__(self, folder: Path) -> None:

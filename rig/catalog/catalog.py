@@ -36,12 +36,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     another process writes for longer than the timeout, `CatalogUnavailable` if the server does not answer, and
     `CatalogError` if the system denies access or the disk is full. The methods name other errors only.
 
-    Attributes
-    ----------
-    database
-        The database; only for the other modules of this package.
-    clock
-        Gives the civil time of what is stored.
+    ``database`` is only for the other modules of this package. ``clock`` gives the civil time of what is stored.
     """
 
     copied_utc: datetime | None = None

@@ -22,15 +22,7 @@ APPLICATION = "hbr-rig catalog"
 
 
 class Database(ABC):
-    """The database of a catalog, and the store of its images.
-
-    Attributes
-    ----------
-    place
-        Where the catalog is.
-    images
-        The store of the images.
-    """
+    """The database of a catalog, and the store of its images."""
 
     place: CatalogPlace
     images: Images

@@ -33,15 +33,6 @@ class OpenEnrollment:
     """An enrollment in progress, as `Catalog.begin` or `Catalog.resume` returns it.
 
     An exception or a power cut loses nothing: the enrollment stays in progress and can be resumed.
-
-    Attributes
-    ----------
-    enrollment
-        The plan.
-    object_name
-        The object.
-    session
-        The present session.
     """
 
     _database: Database

@@ -76,12 +76,8 @@ class Journal(Catalog):
     So an enrollment needs no server while it takes its views. Names are compared with those of the server, or of its
     local copy. If two benches enroll one name, the second one that delivers it has a conflict.
 
-    Attributes
-    ----------
-    server
-        Place of the catalog that gets the enrollments.
-    unreachable
-        The reason why a name could not be compared with those of the server; None if it was.
+    ``server`` is the place of the catalog that gets the enrollments. ``unreachable`` is the reason why a name could not
+    be compared with those of the server; None if it was.
     """
 
     server: CatalogPlace
@@ -188,10 +184,7 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
     A call that is killed at any point is continued by the next one: the server knows an enrollment by its key, and an
     answer, too.
 
-    Parameters
-    ----------
-    replacing
-        Names of objects that replace those of the server.
+    Objects named in ``replacing`` replace those of the server.
 
     Raises `CatalogUnavailable`: the server stopped answering; what was not delivered stays in the journal.
     """

@@ -170,10 +170,7 @@ def connect(root: Path, mode: str, busy_timeout_s: float) -> sqlite3.Connection:
     call functions with side effects. Where Python can (from 3.12), SQLite's defensive mode also rejects statements that
     could damage the file.
 
-    Parameters
-    ----------
-    mode
-        ``rw`` or ``ro``, with further parameters of SQLite's URIs.
+    ``mode`` is ``rw`` or ``ro``, with further parameters of SQLite's URIs.
 
     Raises `CatalogDamaged`: as for `check_folder`.
     """

@@ -89,14 +89,8 @@ class TransferSource(Protocol):
 class CatalogSource:
     """The objects in use of a catalog.
 
-    Parameters
-    ----------
-    names
-        Names of the objects; all if there are none.
-    used_only
-        Only the enrollments that searches use.
-    own
-        It is a catalog of this bench. Its images are compared with their names, but are not decoded again.
+    These ``names``, or all; with ``used_only`` only the enrollments that searches use. If the catalog is this bench's
+    ``own``, its images are compared with their names, but are not decoded again.
     """
 
     rejected: Sequence[RejectedFile] = ()

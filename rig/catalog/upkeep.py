@@ -98,12 +98,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     The rows are removed first, in one transaction. After a crash the next call removes the images. An image that never
     had a row, for example after a crash or by an interrupted import, is kept for `YOUNG_S`.
 
-    Parameters
-    ----------
-    old
-        Also remove the superseded and abandoned enrollments of objects in use.
-    dry_run
-        Change nothing; only return what would be removed.
+    ``old`` also removes the superseded and abandoned enrollments of objects in use. ``dry_run`` changes nothing.
     """
     database, store = catalog.database, catalog.database.images
     unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))

@@ -63,12 +63,8 @@ def circle(at: Point, radius: float, class_: str, *content: str) -> str:
 def drawing(width: float, height: float, label: str, parts: Iterable[str], *, alone: bool = False) -> str:
     """Return the complete chart.
 
-    Parameters
-    ----------
-    label
-        Its alternative text.
-    alone
-        For a file of its own, with the style sheet; otherwise the page has it.
+    ``label`` is its alternative text. ``alone`` is for a file of its own, with the style sheet; otherwise the page has
+    it.
     """
     margin = _MARGIN if alone else 0.0
     box = {"x": -margin, "y": -margin, "width": width + 2 * margin, "height": height + 2 * margin}

@@ -82,12 +82,7 @@ class Axis:
 class Chart:
     """Series over two axes.
 
-    Attributes
-    ----------
-    square
-        A unit of x is as long as a unit of y.
-    wide
-        For charts of many series.
+    ``square``: a unit of x is as long as a unit of y. ``wide`` is for charts of many series.
     """
 
     title: str

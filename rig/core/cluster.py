@@ -26,10 +26,8 @@ _LOCAL: dict[int, Any] = {}
 class Cluster:
     """A Dask cluster.
 
-    Attributes
-    ----------
-    address
-        Address of its scheduler, ``tcp://HOST:8786``; or ``local`` or ``local:WORKERS`` to start one on this computer.
+    ``address`` is that of its scheduler, ``tcp://HOST:8786``; or ``local`` or ``local:WORKERS`` to start one on this
+    computer.
     """
 
     address: str
@@ -53,12 +51,7 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
     The workers need this program in the same version, and the same files under the same names. If a worker dies, other
     workers repeat its items.
 
-    Parameters
-    ----------
-    work
-        A function that can be pickled. Each worker gets it once.
-    items
-        Items that can be pickled.
+    ``work`` and ``items`` can be pickled. Each worker gets ``work`` once.
 
     Raises `ClusterFailed`: the cluster does not answer, or an item ended several workers.
     """

@@ -65,10 +65,7 @@ class DeviceCandidate:
 class DeviceScan:
     """A scan of all ports, buses and cameras, and the devices found.
 
-    Parameters
-    ----------
-    both_protocols
-        Also search for servos of Protocol 1.0 if some of Protocol 2.0 answered.
+    ``both_protocols`` also searches for servos of Protocol 1.0 if some of Protocol 2.0 answered.
     """
 
     both_protocols: bool = False

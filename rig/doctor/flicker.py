@@ -43,12 +43,7 @@ def mains_flicker(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64]) 
     cos(2π (f t + c y)) to the image at time t, with c bands. Both are fitted to the changes of each row. Bands that
     stand still, because f is a multiple of the frame rate, are not recognised: see `standing_flicker`.
 
-    Parameters
-    ----------
-    row_levels : float64 (n, H)
-        Mean level of each row of n images.
-    times_ns : int64 (n,)
-        Time of each image.
+    ``row_levels``, float64 (n, H), is the mean level of each row of n images at ``times_ns``, int64 (n,).
     """
     count, height = row_levels.shape
     if count < 4 or height < _BLOCKS:
@@ -80,18 +75,8 @@ def standing_mains_hz(times_ns: NDArray[np.int64]) -> tuple[float, ...]:
 def steady_levels(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64], mains_hz: float) -> NDArray[np.float64]:
     """Return the level of each row without the bands of the other mains frequencies, which move from image to image.
 
-    Parameters
-    ----------
-    row_levels : float64 (n, H)
-        Mean level of each row of n images; n is 4 or more.
-    times_ns : int64 (n,)
-        Time of each image.
-    mains_hz
-        Frequency of the mains whose bands stand still.
-
-    Returns
-    -------
-    float64 (H,)
+    ``row_levels``, float64 (n, H), is the mean level of each row of n images, 4 or more, at ``times_ns``, int64 (n,).
+    The bands of ``mains_hz`` stand still. Returns float64 (H,).
     """
     columns = [np.ones(len(times_ns))]
     for other_hz in MAINS_HZ:
@@ -110,14 +95,8 @@ def standing_flicker(
     the quotient of both is the bands, and a smooth function of the level if the camera's response is not linear.
     Decision: docs/decisions/0008.
 
-    Parameters
-    ----------
-    with_bands : float64 (H,)
-        Mean level of each row at the exposure time in question.
-    without : float64 (H,)
-        The same at an exposure time of whole periods of the lamp.
-    mains_hz
-        Frequency of the mains.
+    ``with_bands``, float64 (H,), is the mean level of each row at the exposure time in question, ``without`` the same
+    at an exposure time of whole periods of the lamp.
     """
     if len(without) < _BLOCKS:
         return None

@@ -25,14 +25,8 @@ def bench_report(
 ) -> dict[str, Any]:
     """Return the state of a bench, as JSON values; nothing moves.
 
-    Parameters
-    ----------
-    state_path
-        Its state folder, which tells whether a server uses it.
-    open_bench
-        Opens it, but none of its devices except the servo.
-    open_parts
-        Opens its other devices, if the servo does not work.
+    ``state_path`` tells whether a server uses it. ``open_bench`` opens it, but none of its devices except the servo;
+    ``open_parts`` opens its other devices, if the servo does not work.
 
     Raises `RigError`: the server does not answer, or the bench cannot be opened for another reason than a missing
     servo.

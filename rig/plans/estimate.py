@@ -188,14 +188,8 @@ def planned_action(
 class TimeLeft:
     """Remaining time of an enrollment: the motion model, scaled by the time that the views so far really took.
 
-    Parameters
-    ----------
-    model
-        Durations of moves and views on the bench.
-    angles_deg
-        Table angles of the coming views, in their order.
-    in_motion
-        Whether they are taken in one revolution; they are reported after it.
+    ``model`` gives the durations of moves and views, ``angles_deg`` are the table angles of the coming views. Views
+    ``in_motion`` are taken in one revolution, and reported after it.
     """
 
     model: MotionTimes

@@ -177,12 +177,7 @@ class ViewsInMotion(ViewsAtRest):
     The frames of an arc become events at its end. ``live`` gets the event of each frame while the table still rotates.
     It must return at once, because it is called in the control loop.
 
-    Attributes
-    ----------
-    rejected, rejected_in_a_row
-        Count the frames that were not used.
-    goal_deg
-        Where the table rotates to.
+    ``rejected`` and ``rejected_in_a_row`` count the frames that were not used. The table rotates to ``goal_deg``.
     """
 
     first_rest_s: float = FIRST_REST_IN_MOTION_S
@@ -446,13 +441,8 @@ def watch(
     After each answer the table returns to its start angle and unwinds its cable. If no view of an object is acceptable,
     or no object is on the table, the plan yields `Failed` and waits for the next object; any other error ends the plan.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    identify_next
-        Begins `identify` for the next object, with a model of what is enrolled then. Its placer brings the objects,
-        or waits for them.
+    ``identify_next`` begins `identify` for the next object, with a model of what is enrolled then. Its placer brings
+    the objects, or waits for them.
 
     Raises `RigError`: as `identify`, except for `NoObject` and `ViewRejected`.
     """
@@ -496,10 +486,7 @@ class ResultRecorder:
     with_image
         Whether to store images.
 
-    Attributes
-    ----------
-    sample
-        The sample on the table, None if it has no name. It is for one object: give it before each answer.
+    ``sample`` is the sample on the table, None if it has no name. It is for one object: give it before each answer.
     """
 
     place: CatalogPlace | Path

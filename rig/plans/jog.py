@@ -28,14 +28,7 @@ def jog(bench: Bench, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -
 
     A step ends at the table's limits. The torque is on until the plan ends or is closed.
 
-    Parameters
-    ----------
-    bench
-        An open bench; IMU and servo are used.
-    keys
-        The operator's keys; None several times a second while there is no key, so that `rig stop` is noticed.
-    step_deg
-        The first step.
+    The operator's ``keys`` are None several times a second while there is no key, so that `rig stop` is noticed.
 
     Raises `UsageError`: the step is not positive. `FaultLatched`, `Unreferenced`, `MotionStopped`, `Stalled`,
     `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see `Turntable.goto`.

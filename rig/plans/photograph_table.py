@@ -56,14 +56,8 @@ def photograph_table(
     by default ``enroll.views``. Then each image shows another background, so an object that was forgotten is not
     found. The frames are checked like those of views. Closing the generator switches the torque off.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    anyway
-        Store the image although something rotates with the table: a pattern, or a screw that stays there.
-    views
-        The number of images in a revolution of the camera.
+    ``anyway`` stores the image although something rotates with the table: a pattern, or a screw that stays there.
+    ``views`` is the number of images in a revolution of the camera.
 
     Raises `TableNotEmpty`: something rotates with the table, or the surroundings moved. The previous images stay.
     `UsageError`: the object cannot be removed, or the images together are too large. `StateNotStored`: the images

@@ -57,10 +57,8 @@ class ReportView:
 class _Record:
     """The views of a plan, collected event by event.
 
-    Parameters
-    ----------
-    region
-        The part of the images to show: x, y, width, height in pixels (`view.roi` of the configuration); None shows all.
+    ``region`` is the part of the images to show: x, y, width, height in pixels (`view.roi` of the configuration); None
+    shows all.
     """
 
     size: ClassVar[tuple[int, int]]

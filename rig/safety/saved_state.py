@@ -155,10 +155,8 @@ class MemoryStore:
     All stores have these methods. Those of a `FileStore` that write raise `StateNotStored` if the disk is full, or may
     not be written to; `read_file` raises it if the file exists but cannot be read.
 
-    Attributes
-    ----------
-    outlasts_program
-        Whether the next program finds the state: a latched fault then stays latched until it is acknowledged.
+    ``outlasts_program`` says whether the next program finds the state: a latched fault then stays latched until it is
+    acknowledged.
     """
 
     outlasts_program: ClassVar[bool] = False

@@ -185,10 +185,7 @@ class CurrentModel:
     loaded model stays in use, with a note about its age. When the server answers again, the catalog replaces the local
     copy. Use the model in a ``with`` block, which closes the opened catalogs.
 
-    Attributes
-    ----------
-    version
-        `Catalog.version` of the loaded views; empty before the first call.
+    ``version`` is `Catalog.version` of the loaded views; empty before the first call.
     """
 
     catalog: Catalog

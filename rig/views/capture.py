@@ -269,14 +269,8 @@ class Viewer:
 
         Up to `MOST_REPEATED` frames that the camera only repeats do not count as retakes.
 
-        Parameters
-        ----------
-        settled_ns
-            Time at which the table came to rest. Frames exposed before it are rejected.
-        check_still
-            Checks encoder and gyro from a given time on, after the exposure.
-        meanwhile
-            Called several times a second while the program waits for a slow camera.
+        Frames exposed before ``settled_ns`` are rejected. ``check_still`` checks encoder and gyro from a given time on,
+        after the exposure. ``meanwhile`` is called several times a second while the program waits for a slow camera.
         """
         after_ns = settled_ns + self._early_ns
         number = repeated = 0

@@ -28,12 +28,7 @@ class Faults:
     Moves and views are counted from 0 in the simulated world: move k is the first start of the shaft before view k, and
     view k is the first frame that is fetched after it. For the first plan on a bench these are the plan's numbers.
 
-    Attributes
-    ----------
-    history
-        Every `Occurrence` so far.
-    listeners
-        Called with each `Occurrence`.
+    ``history`` has every `Occurrence` so far; ``listeners`` are called with each.
     """
 
     def __init__(self, devices: SimDevices) -> None:

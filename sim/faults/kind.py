@@ -42,12 +42,7 @@ Begin = Callable[[SimDevices, Mapping[str, float], np.random.Generator], End]
 class FaultKind:
     """A kind of simulated fault.
 
-    Attributes
-    ----------
-    what
-        A sentence that describes it.
-    begin
-        Starts the fault in the given devices and returns the function that ends it.
+    ``what`` describes it in a sentence. ``begin`` starts it in the given devices and returns the function that ends it.
     """
 
     name: str

@@ -95,14 +95,9 @@ class SimHead:
     flash
         Program for a library that emulates a microcontroller.
 
-    Attributes
-    ----------
-    world_at_board_time
-        The world at the board's own time, for its sensors.
-    filters
-        Called with (``to_head``, byte) for each byte; returns the byte that arrives, or None if it is lost.
-    listeners
-        Called with each `PinChange`.
+    ``world_at_board_time`` is the world at the board's own time, for its sensors. ``filters`` are called with
+    (``to_head``, byte) for each byte, and return the byte that arrives, or None if it is lost. ``listeners`` are called
+    with each `PinChange`.
 
     Raises `ConfigError`: the firmware cannot be built on this computer.
     """

@@ -19,12 +19,8 @@ _KEPT = 16  # decoded photographs: a move goes from one to the next, and large o
 class PhotographsOnTable:
     """An object.
 
-    Attributes
-    ----------
-    azimuth_deg : float64 (n,)
-        Azimuths of the camera in its photographs, ascending, in [0, 360).
-    files
-        The photographs, in that order.
+    ``azimuth_deg``, float64 (n,), are the azimuths of the camera in its photographs, ascending, in [0, 360), and
+    ``files`` the photographs in that order.
     """
 
     name: str

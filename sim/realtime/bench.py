@@ -28,15 +28,7 @@ class SimBenchOptions(Section):
 
 
 class SimBenchComputer(Computer):
-    """The computer to which the devices of a running simulated bench are connected.
-
-    Parameters
-    ----------
-    folder
-        The folder of the simulated bench.
-    config
-        Configuration with the names of the devices.
-    """
+    """The computer to which the devices of a running simulated bench are connected."""
 
     def __init__(self, folder: Path, config: RigConfig) -> None:
         super().__init__(folder / COMPUTER)

@@ -36,14 +36,7 @@ _OF_ONE_PROGRAM: Final = ("disk_full", "clock_jump")
 class Commands:
     """The commands of the trainee, which change a simulated world.
 
-    Parameters
-    ----------
-    operator
-        The operator that puts objects on the table.
-    devices, faults
-        The devices and simulated faults of the bench.
-    quit
-        Called to end the bench.
+    ``quit`` is called to end the bench.
     """
 
     def __init__(

@@ -34,17 +34,9 @@ class RealTime:
 
     Each use of the world from another thread needs `present`.
 
-    Parameters
-    ----------
-    clock
-        The world's clock.
-    ports
-        Ports through which other programs use the world.
+    Other programs use the world through the ``ports``.
 
-    Attributes
-    ----------
-    over
-        Whether the world has ended: its time stands still.
+    ``over`` says whether the world has ended: its time stands still.
     """
 
     def __init__(self, clock: VirtualClock, ports: Sequence[Port] = ()) -> None:

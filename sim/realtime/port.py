@@ -17,19 +17,11 @@ class PtyPort:
 
     A pseudo-terminal has no baud rate: a program may ask for any, the connection keeps its own.
 
-    Parameters
-    ----------
-    open_connection
-        Opens the simulated connection; raises DeviceNotFound while it is unplugged.
-    link
-        A name of the port that stays the same after it was unplugged.
+    ``open_connection`` raises DeviceNotFound while the device is unplugged. ``link`` is a name of the port that stays
+    the same after it was unplugged.
 
-    Attributes
-    ----------
-    path
-        The pseudo-terminal's device file; empty while it does not exist.
-    sent
-        Number of bytes that other programs were sent.
+    ``path`` is the pseudo-terminal's device file, empty while it does not exist; ``sent`` is the number of bytes that
+    other programs were sent.
 
     Raises `DeviceNotFound`: the device is unplugged. `OSError`: the link cannot be created.
     """

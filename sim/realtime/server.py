@@ -206,15 +206,7 @@ class _Handler(socketserver.StreamRequestHandler):
 
 
 class BenchServer(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
-    """Listens at a socket in ``folder``.
-
-    Parameters
-    ----------
-    folder
-        The bench's folder.
-    devices, time, commands
-        The world to serve.
-    """
+    """Listens at a socket in ``folder``."""
 
     request_queue_size = MAX_CONNECTIONS
 

@@ -27,10 +27,8 @@ class Registers(Protocol):
 class SimulatedServoBase(ABC):
     """A servo with its control table in ``memory`` and its motor on a shaft.
 
-    Attributes
-    ----------
-    distortions
-        Called with the memory after its live registers are updated and before they are read, to falsify the readings.
+    ``distortions`` are called with the memory after its live registers are updated and before they are read, to falsify
+    the readings.
     """
 
     memory: Registers

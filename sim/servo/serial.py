@@ -11,14 +11,8 @@ from sim.servo.bus import SentBytes, ServoBus
 class SimSerial:
     """An open port with the interface of `serial.Serial`; reads wait on the bus's clock.
 
-    Parameters
-    ----------
-    bus
-        The bus at the adapter.
-    baudrate, timeout
-        As in `serial.Serial`: ``timeout`` in seconds, 0: return the available bytes, None: wait without a limit.
-    port
-        The port's name in messages.
+    ``baudrate`` and ``timeout`` are as in `serial.Serial`: ``timeout`` in seconds, 0: return the available bytes, None:
+    wait without a limit.
 
     Raises `serial.SerialException`: the bus already has a host.
     """

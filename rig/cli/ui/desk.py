@@ -27,19 +27,10 @@ from rig.plans.operator import Operator, Unattended
 class CommandDesk(Desk):
     """The desk of a command.
 
-    Parameters
-    ----------
-    settings
-        The options of the command.
-    before
-        Called before each question and each note: removes the live display.
-    yes, with_json
-        Do not ask; ask at a terminal also with ``--json``, because a person must do something.
+    ``before`` is called before each question and each note: it removes the live display. ``yes`` asks nothing;
+    ``with_json`` asks at a terminal also with ``--json``, because a person must do something.
 
-    Attributes
-    ----------
-    bench, catalog
-        Those that the job has opened.
+    ``bench`` and ``catalog`` are those that the job has opened.
     """
 
     bench: Bench

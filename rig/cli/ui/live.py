@@ -50,12 +50,7 @@ ROWS: Final = 12
 class LiveView(AbstractContextManager["LiveView"]):
     """Shows the events of a plan while it runs and lets the operator pause it; use it in a ``with`` block.
 
-    Parameters
-    ----------
-    console
-        The terminal or the pipe to print to; a pipe gets plain lines.
-    keys
-        Whether keys pause the plan; False if the operator types answers meanwhile.
+    A pipe gets plain lines. ``keys`` pause the plan, unless the operator types answers meanwhile.
     """
 
     def __init__(self, console: Console, *, keys: bool = True) -> None:
@@ -189,14 +184,7 @@ COLUMNS_IN_MOTION: Final[Columns] = (
 class EnrollView(LiveView):
     """The table of an enrollment, with a row for each image.
 
-    Parameters
-    ----------
-    console
-        The terminal or the pipe to print to.
-    config
-        Configuration of the bench, for the remaining time.
-    heading
-        Text before the object's name, such as "3 of 25".
+    ``heading`` is the text before the object's name, such as "3 of 25".
     """
 
     def __init__(self, console: Console, config: RigConfig, heading: str = "") -> None:
@@ -293,13 +281,7 @@ def _bar(share: float) -> ProgressBar:
 
 
 class IdentifyView(LiveView):
-    """The candidates after each view, and the decisions.
-
-    Parameters
-    ----------
-    console, keys
-        As for `LiveView`.
-    """
+    """The candidates after each view, and the decisions."""
 
     def __init__(self, console: Console, *, keys: bool = True) -> None:
         super().__init__(console, keys=keys)

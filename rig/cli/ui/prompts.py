@@ -28,12 +28,8 @@ T = TypeVar("T")
 class TerminalOperator:
     """Asks the questions of a job at the terminal, with a beep.
 
-    Parameters
-    ----------
-    is_there
-        Whether a person reads the questions.
-    before
-        Called before each question: removes the live display.
+    ``is_there`` says whether a person reads the questions. ``before`` is called before each question: it removes the
+    live display.
     """
 
     def __init__(self, *, is_there: bool = True, before: Callable[[], None] = lambda: None) -> None:
