@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from math import ceil, cos, radians, sin
 from threading import get_ident
-from typing import Any
+from typing import Any, Protocol
 from zlib import crc32
 
 import cv2
@@ -19,15 +19,13 @@ from hbr.drawing.noise import Noise
 from rig.devices import v4l2
 from sim.calibration_board import BoardOnPlatter
 from sim.camera_controls import BUFFERS_RANGE, EXPOSURE_RANGE, KELVIN_RANGE, NOMINAL_EXPOSURE, SHARP_AT, Controls
-from sim.frame_times import FPS, FrameTimes, frame_after, start_ns
+from sim.frame_times import FPS, FrameTimes, bands, frame_after, row_weights, start_ns
 from sim.noise import NoiseModel
-from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
+from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
-from sim.rolling_shutter import bands, row_weights
 from sim.room import relight, room
 from sim.sensor import STRIP, Sensor
-from sim.visit import seen_on_visit
 from sim.world import HISTORY_S, Activity, Scene, World
 
 CAMERA_DEVICE = "simulated camera"
@@ -435,3 +433,33 @@ class SimCapture:
 def _sensor(noise: NoiseModel, seed: int, binning: int, size: tuple[int, int], _thread: int) -> Sensor:
     """Return the sensor of a world, built for the first frame and shared by all benches of that world in a thread."""
     return Sensor(noise, np.random.default_rng([seed, crc32(b"camera")]), binning, size)
+
+
+_GROUNDS = (24, 232)  # dark and bright, but not clipped: a shadow still changes both
+_OPAQUE = 104  # an object's pixels differ by less on the two grounds; those of its soft shadow by more
+
+
+# -- after a hard change of the bench: the drawn object on a bench of `rig eval` ---------------------------------------
+
+
+class DrawFunction(Protocol):
+    """A function that draws an object into an image, uint8 (480, 640, 3)."""
+
+    def __call__(self, image: Image, /) -> None: ...
+
+
+def seen_on_visit(visit: Visit, draw: DrawFunction | None, table_deg: float) -> Image:
+    """Return the camera's image under nominal light, uint8 (480, 640, 3); without an object, the empty table.
+
+    The object is cut out by drawing it on a dark and on a bright ground. The bench is drawn at half the size.
+    """
+    if draw is None:
+        seen = visit.empty(table_deg)
+    else:
+        dark, bright = (np.full((HEIGHT, WIDTH, 3), level, np.uint8) for level in _GROUNDS)
+        draw(dark)
+        draw(bright)
+        mask = np.max(cv2.absdiff(dark, bright), axis=2) < _OPAQUE
+        foot_px = float(CENTRE_PX[0]), float(CENTRE_PX[1])
+        seen = visit.photograph(dark, mask, table_deg, foot_px=foot_px, px_per_px=0.5).image
+    return np.asarray(cv2.resize(seen, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Times of exposure and arrival of the frames of a simulated camera, and lost frames.
+"""Times of exposure and arrival of the frames of a simulated camera, and of the rows of a frame; and lost frames.
 
 Each number is drawn from the frame's number and the world's seed alone, so that it does not depend on what a program
 has read before.
@@ -7,6 +7,9 @@ has read before.
 from math import log
 from statistics import NormalDist
 from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sim.world import World
 
@@ -73,3 +76,30 @@ def frame_after(time_ns: int) -> int:
     """Return the first frame that begins at or after a time."""
     frame = max(time_ns, 0) * FPS // 1_000_000_000
     return frame if start_ns(frame) >= time_ns else frame + 1
+
+
+def row_weights(exposure: int, readout: int, steps: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return times at which a frame is drawn, (n,), and the share of each image in each row, (n, rows).
+
+    A row is the mean of images that are interpolated linearly between those of the times. So its mean time is exactly
+    the middle of its exposure. Times in ns from the beginning of the first row; at least two.
+    """
+    times = np.linspace(0, exposure + readout, steps)
+    begins = (np.arange(rows) + 0.5) / rows * readout
+    weights = _below(begins + exposure, times) - _below(begins, times)
+    return times, (weights / weights.sum(axis=0)).astype(np.float32)
+
+
+def _below(until: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the integrals up to ``until`` (m,) of functions that are 1 at one of ``times`` and 0 at its neighbours."""
+    away = np.clip((until - times[:, None]) / (times[1] - times[0]), -1, 1)
+    below: NDArray[np.float64] = np.where(away < 0, np.square(1 + away) / 2, 1 - np.square(1 - away) / 2)
+    return below
+
+
+def bands(hz: float, depth: float, start: int, exposure: int, readout: int, rows: int) -> NDArray[np.float32]:
+    """Return the light that each row receives from a flickering lamp during its exposure, (rows, 1, 1)."""
+    begins_s = start * 1e-9 + np.arange(rows) / rows * readout * 1e-9
+    middle_s = begins_s + exposure * 0.5e-9
+    light = 1 + depth * np.sinc(hz * exposure * 1e-9) * np.cos(2 * np.pi * hz * middle_s)
+    return light.astype(np.float32)[:, None, None]

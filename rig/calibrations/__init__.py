@@ -1,9 +1,8 @@
 """Calibration results of a bench: their files, and the settings that they apply."""
 
-from rig.calibrations.apply import apply_results
 from rig.calibrations.rejection import CalibrationRejection, RejectionCode
 from rig.calibrations.result import CalibrationResult, Estimate
-from rig.calibrations.store import BenchCalibration, CalibrationStatus, CalibrationStore, apparatus
+from rig.calibrations.store import BenchCalibration, CalibrationStatus, CalibrationStore, apparatus, apply_results
 
 __all__ = [
     "BenchCalibration",

@@ -1,4 +1,4 @@
-"""`rig demo`: enroll and identify objects on the simulated bench."""
+"""`rig demo`: enroll and identify objects on the simulated bench; and `rig faults`: what can be simulated to fail."""
 
 from pathlib import Path
 from typing import Annotated
@@ -91,3 +91,31 @@ def demo(
         settings.print_json(result.as_dict())
     if not result.good:
         raise typer.Exit(EXIT_QUALITY)
+
+
+@command
+def faults(settings: Settings) -> None:
+    """List the faults that the simulator can inject, with parameters, defaults and units.
+
+    Example: rig faults; then rig demo --fault jam@move3+2s --fault crc_flip:rate=0.2
+    """
+    from sim.faults import fault_kinds
+    from sim.faults.schedule import NOTATION
+
+    if settings.json:
+        for kind in fault_kinds().values():
+            settings.print_json(
+                {
+                    "fault": kind.name,
+                    "what": kind.what,
+                    "parameters": {n: {"default": p.default, "meaning": p.meaning} for n, p in kind.parameters.items()},
+                }
+            )
+        return
+    width = max(map(len, fault_kinds()))
+    for kind in fault_kinds().values():
+        typer.echo(f"{kind.name:<{width}}  {kind.what}")
+        for name, parameter in kind.parameters.items():
+            typer.echo(f"{'':<{width}}    {name}={parameter.default:g}  {parameter.meaning}")
+    typer.echo(f"\nTo inject a fault: rig demo --fault {NOTATION}.")
+    typer.echo('In a file (--faults FILE) or in rig.toml ([bench.sim]): faults = ["jam@move3+2s", "babble@20s+5s"]')

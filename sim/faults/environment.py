@@ -1,14 +1,37 @@
 """Simulated faults of the object and of the computer."""
 
-from collections.abc import Mapping
+import errno
+import os
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
-from sim import disk
 from sim.devices import SimDevices
 from sim.faults.kind import End, Parameter, simulated_fault
 
 Values = Mapping[str, float]
+
+
+_os: Any = os
+
+
+def fill_disk() -> Callable[[], None]:
+    """Fill the disk for this process; return the function that frees it.
+
+    `os.fsync` fails: file systems with delayed allocation or a quota also report a full disk there.
+    """
+    fsync = os.fsync
+
+    def full(_descriptor: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    _os.fsync = full
+
+    def free() -> None:
+        _os.fsync = fsync
+
+    return free
 
 
 @simulated_fault("object_falls", "The object falls off the platter.")
@@ -37,7 +60,7 @@ def _object_moved(devices: SimDevices, values: Values, rng: np.random.Generator)
 
 @simulated_fault("disk_full", "The computer's disk is full. Nothing can be stored.")
 def _disk_full(_parts: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
-    return disk.fill()
+    return fill_disk()
 
 
 @simulated_fault(

@@ -3,16 +3,44 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from enum import Enum
+from functools import cache
+from itertools import product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from rig.config.toml_file import MAX_FILE_BYTES, loads
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import read
 from rig.core.next_steps import Do
-from sim.faults.kind import FaultKind
-from sim.faults.lookup import find_fault
+from sim.faults import camera, environment, imu, servo  # noqa: F401 - each module registers its faults
+from sim.faults.kind import DEVICES, FaultKind, registry
+
+
+@cache
+def fault_kinds() -> Mapping[str, FaultKind]:
+    """Return all kinds by name: first the faults that every device can have, then the others."""
+    words = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
+    order = {f"{device}.{word}": i for i, (device, word) in enumerate(product(DEVICES, words))}
+    return MappingProxyType(dict(sorted(registry.items(), key=lambda item: order.get(item[0], len(order)))))
+
+
+def find_fault(name: str) -> FaultKind:
+    """Return the kind called ``name``.
+
+    Raises `UsageError`: no kind has that name; the next step names the most similar ones.
+    """
+    if name in fault_kinds():
+        return fault_kinds()[name]
+    of_devices = [f"{device}.{name}" for device in DEVICES if f"{device}.{name}" in fault_kinds()]
+    near = of_devices or get_close_matches(name, fault_kinds(), n=2, cutoff=0.5)
+    raise UsageError(
+        f"There is no fault {name!r}.",
+        next_step=f"Did you mean {' or '.join(near)}?" if near else Do.LIST_FAULTS(),
+    )
+
 
 NOTATION = "NAME[:PARAMETER=VALUE...][@TIME[+2s]], where TIME is 12s, move3 or view10 and +2s is the duration"
 

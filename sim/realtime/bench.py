@@ -1,10 +1,15 @@
 """The bench ``sim-bench``: the drivers of a real bench, connected to a simulated bench that another program runs."""
 
+import ctypes
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from errno import EINVAL, EIO, EOPNOTSUPP
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import smbus2.smbus2 as smbus
 from pydantic import BaseModel, Field
 
 from rig.bench import BenchKind
@@ -17,8 +22,125 @@ from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.opencv_capture import Capture
 from rig.safety.saved_state import holder
 from sim.camera import CAMERA_DEVICE
-from sim.realtime.client import RemoteCapture, RemoteI2c, camera_node
-from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, not_running
+from sim.i2c import FUNCTIONS, RoutedFile
+from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, Wire, not_running
+
+
+class RemoteCapture:
+    """The simulated bench's camera; behaves like `cv2.VideoCapture`.
+
+    Raises `DeviceNotFound`: the simulated bench is not running, its camera is unplugged, or another program uses it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._wire = Wire(folder)
+        answer = self._ask("open")[0]
+        if not answer.get("ok"):
+            self.release()
+            raise DeviceNotFound(
+                "Cannot open the simulated camera.",
+                next_step="Close the program that uses it." if answer.get("busy") else "Connect the camera.",
+            )
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return bool(self._ask("isOpened")[0].get("ok"))
+
+    def grab(self) -> bool:
+        return bool(self._ask("grab")[0].get("ok"))
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for a frame for at most this time; return whether `grab` then returns at once."""
+        answer = self._ask("wait", seconds=seconds)[0]
+        return bool(answer.get("ok", True))  # `grab` fails if the simulated bench has ended
+
+    def retrieve(self) -> tuple[bool, Any]:
+        answer, pixels = self._ask("retrieve")
+        if not answer.get("ok"):
+            return False, None
+        return True, np.frombuffer(bytearray(pixels), dtype=np.uint8).reshape(answer["shape"])
+
+    def get(self, propId: int, /) -> float:
+        return float(self._ask("get", property=propId)[0].get("value", 0.0))
+
+    def set(self, propId: int, value: float, /) -> bool:
+        return bool(self._ask("set", property=propId, value=value)[0].get("ok"))
+
+    def release(self) -> None:
+        self._ask("release")  # when it has returned, another program can open the camera
+        self._wire.close()
+
+    def _ask(self, call: str, **values: Any) -> tuple[dict[str, Any], bytes]:
+        try:
+            return self._wire.ask(ask="camera", call=call, **values)
+        except (OSError, ValueError):  # the simulated bench has ended, or the camera is closed
+            return {}, b""
+
+
+def camera_node(folder: Path) -> tuple[int, ...] | None:
+    """Return the identity of the device file of the simulated bench's camera; None if it is unplugged."""
+    try:
+        with closing(Wire(folder)) as wire:
+            node = wire.ask(ask="camera", call="node")[0].get("node")
+    except (DeviceNotFound, OSError, ValueError):
+        return None
+    return None if node is None else (int(node),)
+
+
+class RemoteI2c:
+    """The simulated bench's I2C bus; smbus2 opens ``path``. Opens its connection at the first transfer."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._wire: Wire | None = None
+        self._addressed: dict[int, int] = {}
+        self._file = RoutedFile(self)
+        self.path = self._file.path
+
+    def close(self) -> None:
+        """Remove the bus; a second call does nothing."""
+        self._file.close()
+        if self._wire is not None:
+            self._wire.close()
+
+    def ioctl(self, fd: int, request: int, argument: Any) -> int:
+        """Serve one ``ioctl`` of ``/dev/i2c-N``; raises OSError with the kernel's number."""
+        address = self._addressed.get(fd, 0)
+        match request:
+            case smbus.I2C_FUNCS:
+                argument.value = FUNCTIONS
+            case smbus.I2C_SLAVE | smbus.I2C_SLAVE_FORCE:
+                self._addressed[fd] = argument
+            case smbus.I2C_SMBUS:
+                data = argument.data.contents
+                kind = [argument.read_write, argument.command, argument.size]
+                received = self._transfer(address, smbus=kind, data=bytes(data).hex())
+                ctypes.memmove(argument.data, received, len(received))
+            case smbus.I2C_RDWR:
+                messages = [argument.msgs[i] for i in range(argument.nmsgs)]
+                texts = [None if m.flags & smbus.I2C_M_RD else ctypes.string_at(m.buf, m.len).hex() for m in messages]
+                given = [[m.addr, m.len, text] for m, text in zip(messages, texts, strict=True)]
+                received = self._transfer(address, messages=given)
+                for message in messages:
+                    if message.flags & smbus.I2C_M_RD:
+                        ctypes.memmove(message.buf, received, message.len)
+                        received = received[message.len :]
+            case smbus.I2C_PEC if argument:
+                raise OSError(EOPNOTSUPP, os.strerror(EOPNOTSUPP))
+            case smbus.I2C_PEC:
+                pass
+            case _:
+                raise OSError(EINVAL, os.strerror(EINVAL))
+        return 0
+
+    def _transfer(self, address: int, **transfer: Any) -> bytes:
+        try:
+            self._wire = self._wire or Wire(self._folder)
+            answer, received = self._wire.ask(ask="i2c", address=address, **transfer)
+        except (DeviceNotFound, OSError, ValueError) as error:
+            raise OSError(EIO, os.strerror(EIO)) from error
+        if answer["errno"]:
+            raise OSError(answer["errno"], os.strerror(answer["errno"]))
+        return received
 
 
 class SimBenchOptions(Section):

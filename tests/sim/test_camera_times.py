@@ -8,12 +8,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sim.camera import READOUT_NS, SimCapture
-from sim.frame_times import FPS, start_ns
+from sim.frame_times import FPS, row_weights, start_ns
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.objects.projection import CENTRE_PX, PX_PER_MM
 from sim.objects.shelf import shelf
-from sim.rolling_shutter import row_weights
 from sim.world import World
 from tests.fuzzing import examples
 from tests.sim.drawn_camera import QUIET, Spot, camera, frame, grey, stamp_ns

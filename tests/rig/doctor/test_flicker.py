@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rig.core.next_steps import Do
+from rig.doctor.camera import mains_flicker, standing_flicker, standing_mains_hz
 from rig.doctor.finding import FindingCode
-from rig.doctor.flicker import mains_flicker, standing_flicker, standing_mains_hz
 from sim.faults import Faults
 from sim.faults.schedule import read_faults
 from tests.rig.doctor.doctor_parts import unopened

@@ -27,7 +27,7 @@ from rig.motion.turntable import Turntable
 from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import FileStore
 from rig.safety.supervisor import TableState
-from sim import disk
+from sim.faults.environment import fill_disk
 from sim.servo import XSeriesServo
 from tests.rig.bench_parts import Wires, kill, program, sensor, servo_wires
 
@@ -368,7 +368,7 @@ def test_full_disk_does_not_lose_the_fault_of_a_motion(start, wires):
 
     def jam_on_full_disk() -> None:
         nonlocal free
-        free = disk.fill()
+        free = fill_disk()
         wires.device.jam()
 
     def free() -> None:

@@ -31,7 +31,7 @@ from rig.safety.saved_state import (
     busy,
     holder,
 )
-from sim import disk
+from sim.faults.environment import fill_disk
 from tests.fuzzing import fuzz_settings
 
 HOLD = """
@@ -170,7 +170,7 @@ STALLED = LatchedFault.of(Stalled("Blocked.", next_step="Free it.", evidence={"l
 def test_full_disk_does_not_lose_a_fault(tmp_path):
     store = FileStore(tmp_path)
     store.save(BenchState(table=TABLE))
-    free = disk.fill()
+    free = fill_disk()
     try:
         with pytest.raises(StateNotStored):
             store.save(BenchState())

@@ -30,9 +30,9 @@ from rig.views.empty_table import MAX_AGE_H, empty_table_status
 from rig.views.object_presence import TableWatcher
 from rig.views.table_problems import TableProblem, TableProblemCode
 from rig.views.table_sheet import table_image
-from sim import disk
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES
+from sim.faults.environment import fill_disk
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.small import SMALL
@@ -249,7 +249,7 @@ def test_full_disk_is_reported_and_the_previous_image_stays(simulated: Open, tmp
         """A disk that is full when the image is stored."""
 
         def store_file(self, name: str, content: bytes) -> None:
-            free = disk.fill()
+            free = fill_disk()
             try:
                 super().store_file(name, content)
             finally:

@@ -29,7 +29,7 @@ from sim.bench import ShelfOperator
 from sim.devices import SimDevices
 from sim.faults import Faults
 from sim.objects.shelf import shelf
-from sim.realtime.client import RemoteCapture, RemoteI2c, camera_node
+from sim.realtime.bench import RemoteCapture, RemoteI2c, camera_node
 from sim.realtime.commands import HELP, Commands
 from sim.realtime.pace import RealTime
 from sim.realtime.run import run_bench
