@@ -3,13 +3,10 @@
 Decision: docs/decisions/0009.
 """
 
-import threading
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import and_, func, select
@@ -22,15 +19,12 @@ from rig.catalog.images import Images, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.state import Ended, Named
 from rig.catalog.upkeep import NAMED_IMAGES
-from rig.config.catalog_place import CatalogPlace
-from rig.core.clock import Clock, seconds_between
-from rig.core.errors import CatalogDamaged, RigError
-from rig.core.next_steps import Do
+from rig.core.errors import CatalogDamaged
 from rig.core.processes import Jobs, map_in_processes
 from rig.views import image_files as files
 
 _LINES, _ENROLLMENTS = 100, 10
-"""Lines of the log and enrollments in a portion: other threads of the program wait for milliseconds at most."""
+"""Lines of the log and enrollments in a portion: few rows are in memory at once."""
 _IMAGE: Final = NAMED_IMAGES.c
 _OWNS: Final = and_(Named.object_id == Enrollment.object_id, state.IS_STATE)
 _STATUS: Final = and_(Ended.enrollment_id == Enrollment.id, state.IS_STATUS)
@@ -113,7 +107,7 @@ def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgre
         results = transaction.scalar(select(func.max(Entry.result))) or 0
         images = transaction.scalar(select(func.count(_IMAGE.image))) or 0
         damages = dict.fromkeys(catalog.database.damage(transaction))  # in their order, each once
-        for check in (*row_checks(transaction), _derived):
+        for check in (*_row_checks(transaction), _derived):
             try:
                 findings += check(transaction)
             except CatalogDamaged as damage:  # a row that cannot be read
@@ -133,8 +127,8 @@ def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgre
     return CatalogVerification(objects, views, results, image_bytes, (*damaged, *findings, *of_images))
 
 
-def row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Iterator[CatalogFinding]]]:
-    """Yield the checks of portions of the log and of the enrollments. Each may have a transaction of its own."""
+def _row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Iterator[CatalogFinding]]]:
+    """Yield the checks of portions of the log and of the enrollments."""
     last = transaction.scalar(select(func.max(Entry.id))) or 0
     ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
     for first in range(1, last + 1, _LINES):
@@ -207,69 +201,3 @@ def _check_images(store: Images, portion: Sequence[_RequiredImage]) -> list[Cata
                 sizes = {"bytes": len(content), "stored_bytes": stored_bytes}
                 findings.append(found(CatalogProblem.CHANGED_IMAGE, details=sizes))
     return findings
-
-
-SHARE: Final = 0.05
-"""Largest share of a processor core that a background check uses, after the first `BURST_S` of work."""
-BURST_S: Final = 0.1
-"""Small catalogs are compared at once."""
-
-
-class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
-    """A thread that compares the digests of the catalog at ``place`` until all are compared or a ``with`` block ends.
-
-    Searches and exports compare the digests of what they load. This compares the others: of deleted objects, unfinished
-    and earlier enrollments, the log and the results; not the images. A portion is one transaction, so that a change of
-    the catalog in the meantime is no damage. ``report`` gets the first damage; it is called in the thread.
-    """
-
-    def __init__(self, place: CatalogPlace | Path, clock: Clock, report: Callable[[RigError], None]) -> None:
-        self._place = place
-        self._clock = clock
-        self._report = report
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="catalog check", daemon=True)
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def wait(self, timeout_s: float | None = None) -> None:
-        """Wait until all digests are compared, or damage is reported."""
-        self._thread.join(timeout_s)
-
-    def _run(self) -> None:
-        start_ns = begun_ns = self._clock.now_ns()
-        spent_s = 0.0
-        try:
-            with Catalog.open(self._place, clock=self._clock, create=False, read_only=True) as catalog:
-                with catalog.database.read() as transaction:
-                    checks = list(row_checks(transaction))
-                for check in checks:
-                    with catalog.database.read() as transaction:
-                        for finding in check(transaction):
-                            raise _error(finding)
-                    now_ns = self._clock.now_ns()
-                    spent_s += seconds_between(begun_ns, now_ns)
-                    pause_s = (spent_s - BURST_S) / SHARE - seconds_between(start_ns, now_ns)
-                    if pause_s > 0 and self._ended.wait(
-                        pause_s
-                    ):  # a command that is short still gets its first portion
-                        return
-                    begun_ns = self._clock.now_ns()
-        except CatalogDamaged as damage:
-            self._report(damage)
-        except RigError:
-            pass  # the catalog was moved or is locked: the work itself reports it
-
-
-def _error(finding: CatalogFinding) -> CatalogDamaged:
-    if finding.problem is not CatalogProblem.LOG_CHANGED:
-        return state.changed([str(finding.object_name)])
-    line = finding.details["entry_id"]
-    return CatalogDamaged(
-        f"Entry {line} of the log of the catalog is not the one that was written, or entries are missing.",
-        next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
-        evidence={"log_entry": line},
-    )

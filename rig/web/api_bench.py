@@ -22,7 +22,6 @@ from rig.web.answers import (
     Svg,
 )
 from rig.web.hub import MAX_LISTENERS
-from rig.web.problems import problem
 from rig.web.requests import AnswerBody, Job, JobRequest, LeaseBody, LoginBody
 from rig.web.server import API, COOKIE, OperatorPerson, Page, Routes, Server, Watcher, require_operate
 
@@ -82,7 +81,7 @@ def add_bench(routes: Routes, server: Server) -> None:
             "bench": server.setup.bench,
             "server": {"listeners": server.hub.listeners},
             "catalog": server.catalog.state,
-            "problem": server.remote.status.get("problem") or (problem(server.damage) if server.damage else None),
+            "problem": server.remote.status.get("problem"),
         }
 
     @routes.watch.post("/stop", tags=["bench"], response_model=Stopped)

@@ -12,15 +12,12 @@ import signal
 import socket
 import sys
 import threading
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final
 
 import uvicorn
 from anyio import to_thread
 
-from rig.catalog.verify import BackgroundCheck
 from rig.core.clock import SystemClock
-from rig.core.errors import RigError
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.web.access import Lease, Sessions, Tokens
 from rig.web.api_catalog import UPLOAD
@@ -62,19 +59,6 @@ def make_server(setup: Setup, clock: SystemClock) -> Server:
         lease=Lease(clock, lambda values: hub.publish("lease", values)),
         catalog=catalog,
     )
-
-
-def checked_catalog(server: Server) -> AbstractContextManager[object]:
-    """Return a check of the catalog during the work of a ``with`` block; damage is on stderr and in the status."""
-    place = server.setup.catalog_place
-    if not place.may_exist():
-        return nullcontext()
-
-    def report(damage: RigError) -> None:
-        server.damage = damage
-        print_note(f"{damage.what} Next step: {damage.next_step}")
-
-    return BackgroundCheck(place, server.clock, report)
 
 
 def guarded(server: Server) -> Guard:
@@ -153,7 +137,7 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
     server.remote.connect(socket.socket(fileno=link_descriptor), ended)
     web = _Web(uvicorn_config(guarded(server), setup.listening), server.remote.link)
     shorten_pauses()
-    with checked_catalog(server), server.catalog.background_delivery():
+    with server.catalog.background_delivery():
         web.run([socket.socket(fileno=socket_descriptor)])
 
 

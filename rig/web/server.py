@@ -29,7 +29,7 @@ MAX_PAGE: Final = 500  # larger: a list holds the process that receives STOP for
 class Server:
     """The objects that the application works with.
 
-    ``remote`` is the bench, which another process owns; ``damage`` is that of the catalog, None if none is known.
+    ``remote`` is the bench, which another process owns.
     """
 
     setup: Setup
@@ -39,7 +39,6 @@ class Server:
     sessions: Sessions
     lease: Lease
     catalog: BenchCatalog
-    damage: RigError | None = None
 
     def person(self, request: HTTPConnection) -> Person | None:
         """Return the sender of a request; None if it is not known.

@@ -104,14 +104,13 @@ def enroll(
     shown = _Shown(settings, report, [f"To continue{others}:", _command(settings, given, *continued)])
     desk = shown.desk = CommandDesk(settings, shown.close_view, yes=yes)
     desk.deliver_waiting()
-    with desk.background_check():
-        if name is not None:
-            labels = ", ".join(label) if label else None
-            job = enroll_job(desk, name, **how, label=labels, note=note, resume=resume, replace=replace, ask=not yes)
-            shown.run(job)
-        else:
-            shown.run(enroll_list(desk, items, **how, ask=not yes))
-            shown.print_total(len(items))
+    if name is not None:
+        labels = ", ".join(label) if label else None
+        job = enroll_job(desk, name, **how, label=labels, note=note, resume=resume, replace=replace, ask=not yes)
+        shown.run(job)
+    else:
+        shown.run(enroll_list(desk, items, **how, ask=not yes))
+        shown.print_total(len(items))
 
 
 def _command(settings: Settings, given: "Mapping[str, Any]", *arguments: str) -> str:

@@ -86,7 +86,6 @@ def identify(
     desk = CommandDesk(settings)
     with ExitStack() as beside, IdentifyView(screen, keys=not scan) as view:
         if watch:
-            beside.enter_context(desk.background_check())
             beside.enter_context(desk.background_delivery())
         job = identify_job(
             desk,

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, suppress
 
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
@@ -10,12 +10,10 @@ from rig.catalog import Catalog
 from rig.catalog.copying import open_or_copy
 from rig.catalog.jobs import JobProgress
 from rig.catalog.journal import BackgroundDelivery, waiting
-from rig.catalog.verify import BackgroundCheck
 from rig.cli.ui import prompts
 from rig.cli.ui.present import ProgressBar as ProgressBar
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
-from rig.core.errors import RigError
 from rig.core.next_steps import in_words
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
@@ -74,16 +72,6 @@ class CommandDesk(Desk):
     def background_delivery(self) -> BackgroundDelivery:
         """Return a delivery of the journal during the work of a ``with`` block; its results are printed on stderr."""
         return BackgroundDelivery(self.place, SystemClock(), _print_note)
-
-    def background_check(self) -> AbstractContextManager[object]:
-        """Return a check of the bench's catalog during the work of a ``with`` block; damage is printed on stderr."""
-        if not self.place.may_exist():
-            return nullcontext()
-
-        def report(damage: RigError) -> None:
-            _print_note(f"{damage.what} Next step: {damage.next_step}")
-
-        return BackgroundCheck(self.place, SystemClock(), report)
 
     def preparing(self) -> AbstractContextManager[Callable[[JobProgress], None]]:
         return ProgressBar("Preparing objects for searches")

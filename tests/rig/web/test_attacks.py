@@ -3,8 +3,6 @@
 import pytest
 
 from rig.web.access import Role
-from rig.web.front import checked_catalog
-from tests.rig.catalog.catalog_samples import fill, sql
 
 API = "/api/v1"
 
@@ -151,18 +149,6 @@ def test_lists_have_pages_and_etags(serve):
     assert len(rest.json()["items"]) == 1
     assert served.client.get(f"{API}/jobs?limit=2", headers={"If-None-Match": first.headers["etag"]}).status_code == 304
     assert served.client.get(f"{API}/jobs?after=nothing").status_code == 422
-
-
-def test_damage_of_the_catalog_is_in_the_status(serve, capsys):
-    served = serve()
-    with served.server.catalog.open_to_change() as catalog:
-        fill(catalog, "a", 1)
-        sql(catalog, "UPDATE log SET label = 'x' WHERE id = 1")
-    assert served.client.get(f"{API}/status").json()["problem"] is None
-    with checked_catalog(served.server) as check:
-        check.wait()
-    assert served.client.get(f"{API}/status").json()["problem"]["code"] == 707
-    assert "rig catalog verify" in capsys.readouterr().err
 
 
 def test_metrics_contain_the_state_of_the_bench(serve):
