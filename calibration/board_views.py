@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import pictures
 from calibration.procedure import Ask, Evaluation
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -32,20 +31,13 @@ LOOSE_DEG = 1.5
 """Largest difference of a rotation between board and encoder; beyond it the board is loose, or the table moved."""
 
 STANDS = {
-    "calibration-board upright": "upright in the middle of the platter, facing the camera",
-    "calibration-board back": "leaning back by about 30°, facing the camera",
+    "calibration-board upright": "upright in the middle of the platter, across the axis, facing the camera",
+    "calibration-board back": "in the middle, leaning back by about 30°, facing the camera",
     "calibration-board left": "upright at the left edge of the platter, facing the camera, rotated a little in its "
     "plane",
     "calibration-board right": "leaning back by about 15° at the right edge, rotated in its plane the other way",
 }
 """The positions of the board, by the names that a simulated bench knows."""
-
-PICTURES = {
-    "calibration-board upright": pictures.BOARD_UPRIGHT,
-    "calibration-board back": pictures.BOARD_BACK,
-    "calibration-board left": pictures.BOARD_LEFT,
-    "calibration-board right": pictures.BOARD_RIGHT,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +69,6 @@ def take_views(
         yield Ask(
             f"Put the calibration board {words}. Fix it there, and take your hands off. Its squares are "
             f"{board.square_mm:g} mm wide, as measured on the print (--square-mm).",
-            PICTURES[stand],
         )
         bench.place(stand)
         with Turntable(bench) as table:

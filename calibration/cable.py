@@ -5,7 +5,6 @@ The servo counts the revolutions itself while its supply is on.
 
 from dataclasses import dataclass
 
-from calibration import pictures
 from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -27,12 +26,10 @@ class Cable(Procedure):
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         bench.servo.torque_off()
         ends_deg = []
-        for direction, picture in (("counter-clockwise", pictures.ROTATE_LEFT), ("clockwise", pictures.ROTATE_RIGHT)):
-            yield Ask(
-                f"Rotate the table by hand {direction}, seen from above, until the cable is almost taut.", picture
-            )
+        for direction in ("counter-clockwise", "clockwise"):
+            yield Ask(f"Rotate the table by hand {direction}, seen from above, until the cable is almost taut.")
             ends_deg.append(bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg))
-        yield Ask("Rotate the table back by hand until the cable hangs free.", pictures.CABLE_FREE)
+        yield Ask("Rotate the table back by hand until the cable hangs free.")
         yield evaluate(*ends_deg, pan=bench.config.table.mode == "pan")
 
 

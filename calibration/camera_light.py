@@ -15,7 +15,6 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import pictures
 from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -151,7 +150,6 @@ class CameraNoise(Procedure):
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         yield Ask(
             "Put the board upright in the middle of the platter, with the usual light. Take your hands off.",
-            pictures.BOARD_UPRIGHT,
         )
         bench.place(BOARD)
         bench.clock.sleep(HANDS_S)
@@ -169,8 +167,7 @@ class CameraCard(Procedure):
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         yield Ask(
-            "Hold a plain grey or white card in front of the camera so that it fills the frame, with the usual light.",
-            pictures.CARD,
+            "Hold a plain grey or white card near the lens so that it fills the frame, lit evenly by the usual light.",
         )
         bench.place(CARD)
         bench.clock.sleep(HANDS_S)

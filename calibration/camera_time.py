@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import pictures
 from calibration.camera_light import BOARD
 from calibration.procedure import Ask, Evaluation, Measured, Procedure, lower_end, returning
 from rig.bench import Bench
@@ -275,7 +274,6 @@ class CameraTime(Procedure):
             return
         yield Ask(
             "Put the board upright in the middle of the platter, or any object with texture. Take your hands off.",
-            pictures.BOARD_UPRIGHT,
         )
         bench.place(self.thing)
         cruise_dps = config.table.velocity_dps

@@ -29,13 +29,9 @@ Plot = Callable[[CalibrationResult], Chart | None]
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """A request to the operator; the procedure continues when the next event is requested.
-
-    ``picture`` shows the request on a terminal.
-    """
+    """A request to the operator; the procedure continues when the next event is requested."""
 
     words: str
-    picture: str = ""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -179,9 +175,9 @@ def _measured(desk: Desk, bench: Bench, store: CalibrationStore, procedure: Proc
                 if not step.passed:
                     return False
             elif isinstance(step, Ask):
-                question = Question(Subject.CALIBRATION, step.words, picture=step.picture)
+                question = Question(Subject.CALIBRATION, step.words)
                 if not desk.operator.is_there:
-                    yield Remark(step.words, is_warning=False, picture=step.picture)
+                    yield Remark(step.words, is_warning=False)
                 elif desk.operator.choose(question) is Choice.STOP:
                     return False
             else:

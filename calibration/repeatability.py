@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from calibration import pictures
 from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -100,7 +99,6 @@ class Repeatability(Procedure):
             yield Ask(
                 f"Put {self.name} at its mark on the platter, {again} (placement {number} of {self.placements}). Take "
                 "your hands off.",
-                pictures.OBJECT_AT_MARK,
             )
             bench.place(self.name)
             rounds = []

@@ -25,13 +25,12 @@ from rig.plans.operator import Operator, Unattended
 class Remark:
     """A sentence for the operator: about the catalog, the journal, the log, or an ``event`` that prepares the job.
 
-    ``steps`` says what to do about it. ``picture`` is a drawing of letters for a terminal.
+    ``steps`` says what to do about it.
     """
 
     text: str
     is_warning: bool = True
     event: Event | None = None
-    picture: str = ""
     steps: SomeSteps = ()
 
 

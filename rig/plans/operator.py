@@ -52,8 +52,6 @@ class Question:
         The answer of the key Enter.
     unattended
         The answer if there is no operator.
-    picture
-        A drawing of letters for a terminal.
     steps
         What is to be done before the answer, as the next step of an error.
     """
@@ -63,7 +61,6 @@ class Question:
     choices: Mapping[Choice, str] = field(default_factory=lambda: {Choice.CONTINUE: "continue", Choice.STOP: "stop"})
     default: Choice = Choice.CONTINUE
     unattended: Choice = Choice.CONTINUE
-    picture: str = ""
     steps: SomeSteps = ()
 
 

@@ -80,8 +80,7 @@ class CommandDesk(Desk):
         """Print a remark of a job on stderr."""
         self._before()
         text = " ".join(filter(None, (remark.text, in_words(remark.steps))))
-        picture = "" if self._settings.json else remark.picture
-        print(f"{'Note: ' if remark.is_warning else ''}{text}{picture}", file=sys.stderr, flush=True)
+        print(f"{'Note: ' if remark.is_warning else ''}{text}", file=sys.stderr, flush=True)
 
     def run(self, steps: Steps[object], show: Callable[[Event], None] | None = None) -> object:
         """Run a job to its end, and return what it returns; by default its events are printed line by line."""

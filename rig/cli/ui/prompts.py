@@ -41,7 +41,7 @@ class TerminalOperator:
         keys = {"" if choice is question.default else _KEYS[choice]: choice for choice in question.choices}
         hints = ", ".join(f"{key or 'Enter'}: {question.choices[choice]}" for key, choice in keys.items())
         words = "\n".join(filter(None, (question.text, in_words(question.steps))))
-        text = f"{words}{question.picture}\n  {hints}"
+        text = f"{words}\n  {hints}"
         # At the end of the input, a question is answered with its last choice, unless Enter would stop the job.
         ask = ask_line if question.default is Choice.STOP else read_answer
         while True:
