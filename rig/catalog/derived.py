@@ -7,21 +7,19 @@ missing, old or damaged result is computed again, so the table can be emptied at
 Decision: docs/decisions/0010.
 """
 
-import re
-from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session as Transaction
 
 import hbr
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import near
-from hbr.descriptors import descriptor, names
+from hbr.descriptors import descriptor
 from hbr.kernels.library import THREADS
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import log, state
@@ -37,13 +35,12 @@ from rig.catalog.describing import (
     evidence_of,
     held_pixels,
     known_descriptor,
-    record_of,
     records_of,
     store,
     stored_contents,
     task_of,
 )
-from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, seal_of
+from rig.catalog.facts import Action, Enrollment, Entry, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, finished, processes
 from rig.catalog.records import EnrollmentStatus, Region
 from rig.config import ViewConfig
@@ -293,19 +290,3 @@ def _described_now(
         done.append((task, result))
         yield JobProgress(len(done), len(tasks))
     return done
-
-
-def counts(transaction: Transaction) -> list[tuple[str, int, int, bool]]:
-    """Return name, version and number of views of each stored descriptor, and whether this program uses the version."""
-    rows = transaction.execute(
-        select(Derived.what, Derived.made_by, func.sum(func.length(Derived.content)))
-        .where(Derived.what.in_(names()))
-        .group_by(Derived.what, Derived.made_by)
-    )
-    found: Counter[tuple[str, int]] = Counter()
-    for what, made_by, size in rows:
-        if version := re.match(r"\S+ ([0-9]{1,9})\b", made_by or ""):
-            found[what, int(version[1])] += (size or 0) // record_of(descriptor(what)).itemsize
-    return [
-        (name, version, views, version == descriptor(name).version) for (name, version), views in sorted(found.items())
-    ]

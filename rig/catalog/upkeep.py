@@ -10,7 +10,7 @@ from typing import Any, Final
 from sqlalchemy import Select, delete, func, null, or_, select, true, union_all
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import derived, log, state
+from rig.catalog import log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.facts import SCHEMA_VERSION, Action, Derived, Enrollment, Entry, Session, View
 from rig.catalog.jobs import portions
@@ -29,16 +29,6 @@ _OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
 
 
 @dataclass(frozen=True, slots=True)
-class DescriptorStatistics:
-    """Number of views with a version of a descriptor. `current`: this program can compare it."""
-
-    name: str
-    version: int
-    views: int
-    current: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Statistics:
     """Numbers and sizes in bytes; `free_disk_bytes` is None for an object store."""
 
@@ -50,7 +40,6 @@ class Statistics:
     image_bytes: int
     database_bytes: int
     free_disk_bytes: int | None
-    descriptors: tuple[DescriptorStatistics, ...]
     log_entries: int
     results: int
     result_image_bytes: int
@@ -85,7 +74,6 @@ def statistics(catalog: Catalog) -> Statistics:
             image_bytes=sum(size or 0 for *_, size in found),
             database_bytes=catalog.database.size_bytes(transaction),
             free_disk_bytes=catalog.database.images.free_bytes(),
-            descriptors=tuple(DescriptorStatistics(*one) for one in derived.counts(transaction)),
             log_entries=log.head(transaction)[0],
             results=results,
             result_image_bytes=result_bytes or 0,

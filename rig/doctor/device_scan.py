@@ -51,14 +51,10 @@ class FoundCamera:
 
 @dataclass(frozen=True, slots=True)
 class DeviceCandidate:
-    """A device that may be the servo, the IMU or the camera of the table, in words, and its settings by key.
-
-    ``file`` is its own device file, if it disappears when the device is unplugged.
-    """
+    """A device that may be the servo, the IMU or the camera of the table, in words, and its settings by key."""
 
     words: str
     settings: dict[Key, Any]
-    file: DeviceFile | None = None
 
 
 @dataclass
@@ -101,7 +97,6 @@ class DeviceScan:
                     ("servo", "id"): found.bus_id,
                     ("servo", "model"): found.model,
                 },
-                port,
             )
             for port, found in self.servos
         ]
@@ -124,7 +119,7 @@ class DeviceScan:
             for port in self.heads
         ]
         cameras = [
-            DeviceCandidate(f"{c.node.path}: {c.node.name}, {c.width}x{c.height}", camera_settings(c), c.node)
+            DeviceCandidate(f"{c.node.path}: {c.node.name}, {c.width}x{c.height}", camera_settings(c))
             for c in self.cameras
         ]
         ribbons = [

@@ -22,7 +22,6 @@ from rig.web.problems import Problem, ProblemResponse
 from rig.web.requests import JobState
 from rig.web.server import API, Routes, Server, Watcher
 
-QUANTILES: Final = (0.5, 0.99, 0.999)  # the usual interval, and the rare ones that endanger the control loop
 _ERRORS: Final[dict[int | str, dict[str, Any]]] = {
     "4XX": {"model": Problem, "description": "The request cannot be carried out; `code` and `next_step` say why"},
     "5XX": {"model": Problem, "description": "The bench or the catalog is not available"},
@@ -105,9 +104,3 @@ class _Numbers(Collector):
             ended.add_metric([name], number)
         yield ended
         yield CounterMetricFamily("rig_stops", "Presses of STOP since the server started.", numbers["stops"])
-        if intervals := sorted(numbers["intervals_s"]):
-            text = "Time between two readings of the servo in motion."
-            polls = GaugeMetricFamily("rig_servo_poll_seconds", text, labels=["quantile"])
-            for quantile in QUANTILES:
-                polls.add_metric([str(quantile)], intervals[min(int(quantile * len(intervals)), len(intervals) - 1)])
-            yield polls

@@ -159,11 +159,7 @@ class BenchSide:
         return {"number": number, "age_s": self.picture.age_s}, content
 
     def _numbers(self) -> dict[str, Any]:
-        return {
-            "jobs_ended": self.worker.jobs_ended,
-            "stops": self.stops.count(),
-            "intervals_s": list(self.worker.intervals_s),
-        }
+        return {"jobs_ended": self.worker.jobs_ended, "stops": self.stops.count()}
 
 
 class WebProcess:

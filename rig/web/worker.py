@@ -5,7 +5,6 @@ the running job and switch the torque off, as in every other command.
 """
 
 import threading
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
@@ -30,7 +29,6 @@ STATUS_S: Final = 0.25  # a page that shows the angle looks smooth enough; more 
 IDLE_STATUS_S: Final = 1.0  # at rest, the state changes by hand or supply only, and each reading occupies the bus
 REOPEN_S: Final = 5.0
 """Time after which a bench that could not be opened is opened again."""
-INTERVALS: Final = 20_000  # of the control loop, for /metrics: some minutes of motion
 JOBS_WITH_PICTURES: Final = 10  # older jobs keep their events, without pictures
 _LOST: Final = (DeviceNotFound, DeviceMismatch, DeviceSilent)
 """After these errors the bench is opened again: a device was unplugged or replaced."""
@@ -79,8 +77,6 @@ class BenchWorker:
         self.charts: dict[str, str] = {}
         """Charts of the candidates of the last jobs as SVG, after their last view."""
         self._status_ns = 0
-        self._polled_ns: int | None = None
-        self.intervals_s: deque[float] = deque(maxlen=INTERVALS)
         self.jobs_ended: dict[str, int] = {}
 
     def end(self) -> None:
@@ -110,7 +106,6 @@ class BenchWorker:
         for old in list(self.views)[:-JOBS_WITH_PICTURES]:
             del self.views[old]
             self.charts.pop(old, None)
-        self._polled_ns = None
         state, error = JobState.FAILED, None
         try:
             if self._bench is not None:
@@ -232,11 +227,7 @@ class BenchWorker:
 
     def _observe(self, state: ServoState) -> None:
         """Take a reading of the servo from the control loop."""
-        now_ns = self._clock.now_ns()
-        if self._polled_ns is not None and state.moving:
-            self.intervals_s.append(seconds_between(self._polled_ns, now_ns))
-        self._polled_ns = now_ns if state.moving else None
-        if seconds_between(self._status_ns, now_ns) >= STATUS_S:
+        if seconds_between(self._status_ns, self._clock.now_ns()) >= STATUS_S:
             self._publish_status(state)
 
     def _read_status(self) -> None:

@@ -1,7 +1,7 @@
 """`rig setup`: find the devices and write a rig.toml."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -136,45 +136,16 @@ class Dialogue:
         if self.ask_nothing:
             print(f"! {len(found)} devices could be the {what}; its configuration is unchanged.", file=self.out)
             return None
-        files = [one.file for one in found if one.file is not None]
-        can_unplug = len(files) == len(found) and len({file.path for file in files}) > 1
-        index = prompts.ask_choice(
-            f"Which is the table's {what}?",
-            [one.words for one in found],
-            other="find out by unplugging it" if can_unplug else "",
-        )
-        if index is not None:
-            return found[index]
-        computer = self.context.computer
-        gone = self._unplugged(what, lambda: [*computer.serial_ports(), *computer.cameras()])
-        return next((one for one, file in zip(found, files, strict=True) if gone and file.path == gone.path), None)
-
-    def _unplugged(self, what: str, there: "Callable[[], Sequence[DeviceFile]]") -> "DeviceFile | None":
-        """Find a device's file: the operator unplugs the device and plugs it in again."""
-        before = there()
-        while True:
-            prompts.ask_line(f"Unplug the {what}'s USB cable, then press Enter.")
-            left = {node.path for node in there()}
-            gone = [node for node in before if node.path not in left]
-            prompts.ask_line("Plug it in again, then press Enter.")
-            if len(gone) == 1:
-                print(f"Found: {gone[0].path} ({gone[0].name}).", file=self.out)
-                return gone[0]
-            print(f"{len(gone) or 'No'} device{'s' if len(gone) != 1 else ''} disappeared.", file=self.out)
-            if not prompts.ask_yes_no("Try again?", default=True):
-                return None
+        index = prompts.ask_choice(f"Which is the table's {what}?", [one.words for one in found])
+        return found[index]
 
     def _which_port(self) -> None:
         """Find the servo's adapter although no servo answers."""
         ports = [port for port in self.context.computer.serial_ports() if port.usb]
         port: DeviceFile | None = ports[0] if len(ports) == 1 else None
         if len(ports) > 1 and not self.ask_nothing:
-            index = prompts.ask_choice(
-                "Which is the servo's adapter?",
-                [f"{each.path}: {each.name}" for each in ports],
-                other="find out by unplugging it",
-            )
-            port = ports[index] if index is not None else self._unplugged("adapter", self.context.computer.serial_ports)
+            words = [f"{each.path}: {each.name}" for each in ports]
+            port = ports[prompts.ask_choice("Which is the servo's adapter?", words)]
         if port is not None and not self.context.computer.same_file(port.path, self.context.config.servo.port):
             self.wanted[_PORT] = port.stable or port.path
 

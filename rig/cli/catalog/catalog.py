@@ -254,10 +254,6 @@ def stats(settings: Settings) -> None:
         "images": size_words(found.image_bytes),
         "database": size_words(found.database_bytes),
         "free": "–" if found.free_disk_bytes is None else size_words(found.free_disk_bytes),
-        **{
-            f"{kind.name} {kind.version}": f"{kind.views} views" + ("" if kind.current else ", to be computed again")
-            for kind in found.descriptors
-        },
         "log": f"{found.log_entries} entries",
         "results": f"{found.results}, {size_words(found.result_image_bytes)} of images",
     }

@@ -129,20 +129,16 @@ def confirm(question: str, *, yes: bool, settings: Settings) -> None:
         raise typer.Exit(EXIT_DECLINED)
 
 
-def ask_choice(question: str, options: Sequence[str], *, other: str = "") -> int | None:
-    """Return the index of the chosen option; None for ``other``, which the operator chooses with ``o``."""
+def ask_choice(question: str, options: Sequence[str]) -> int:
+    """Return the index of the chosen option."""
     print(question, file=sys.stderr)
     for number, option in enumerate(options, start=1):
         print(f"  {number}  {option}", file=sys.stderr)
-    if other:
-        print(f"  o  {other}", file=sys.stderr)
     while True:
-        answer = ask_line(f"1–{len(options)}{' or o' if other else ''}:").lower()
+        answer = ask_line(f"1–{len(options)}:")
         if (chosen := whole(answer)) is not None and 1 <= chosen <= len(options):
             return chosen - 1
-        if answer == "o" and other:
-            return None
-        print(f"Answer with a number from 1 to {len(options)}{', or with o' if other else ''}.", file=sys.stderr)
+        print(f"Answer with a number from 1 to {len(options)}.", file=sys.stderr)
 
 
 def ask_value(question: str, default: T, parse: Callable[[str], T]) -> T:

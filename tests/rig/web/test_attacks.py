@@ -157,4 +157,3 @@ def test_metrics_contain_the_state_of_the_bench(serve):
     text = served.client.get("/metrics").text
     assert "rig_bench_open 1.0" in text
     assert 'rig_jobs{state="done"} 1.0' in text
-    assert 'rig_servo_poll_seconds{quantile="0.999"}' in text

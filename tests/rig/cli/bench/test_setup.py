@@ -1,19 +1,15 @@
 """`rig setup`, `rig doctor`, `rig find` and `rig servo` on simulated parts."""
 
-import io
 import json
 import shutil
 import signal
 from contextlib import contextmanager
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from rig.bench.hardware import NoOptions
-from rig.cli.bench.setup import setup
 from rig.cli.main import app
-from rig.cli.ui.settings import Settings
 from rig.config import load_config
 from tests.programs import Program
 from tests.rig.doctor.doctor_parts import unopened
@@ -171,37 +167,13 @@ def test_servo_that_the_rig_cannot_drive_is_neither_configured_nor_changed(parts
     assert (memory["Operating Mode"], memory["Return Delay Time"]) == (3, 250)
 
 
-class Operator(io.StringIO):
-    """Answers, each with an action of the operator before."""
-
-    def __init__(self, *lines) -> None:
-        super().__init__()
-        self.lines = list(lines)
-
-    def readline(self, *_):
-        line, act = self.lines.pop(0)
-        act()
-        return line
-
-
-def test_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
+def test_operator_chooses_one_of_several_adapters(parts, home, monkeypatch):
     monkeypatch.setattr("rig.doctor.device_scan.BAUD_RATES_1", (1_000_000,))
     parts.devices.servo_bus.detach(parts.devices.servo)  # nothing answers: the ports cannot be told apart
     parts.computer.serial_port("ttyUSB5", serial="OTHER")
-    class_file = parts.computer.root / "sys/class/tty/ttyUSB5"
-    aside = parts.computer.root / "aside"
-    operator = Operator(
-        ("n\n", lambda: None),  # look for servos again?
-        ("o\n", lambda: None),
-        ("\n", lambda: shutil.move(class_file, aside)),
-        ("\n", lambda: shutil.move(aside, class_file)),
-        ("\n", lambda: None),
-        ("y\n", lambda: None),
-    )
-    monkeypatch.setattr("rig.cli.ui.prompts.sys.stdin", operator)
-    with pytest.raises(typer.Exit) as ended:
-        setup.__wrapped__(Settings(), yes=False)
-    assert ended.value.exit_code == 4
+    done = rig("setup", answers="n\n3\n2\n\ny\n")
+    assert done.exit_code == 4
+    assert "Answer with a number from 1 to 2" in done.stderr
     assert load_config(home / "rig.toml").servo.port.endswith("OTHER-if00-port0")
 
 
