@@ -8,10 +8,11 @@ from typing import Self
 
 import serial
 
-from rig.config import RigConfig
+from rig.config import RigConfig, ServoConfig
 from rig.config.imus import imu_kind
 from rig.core.errors import ConfigError, DeviceNotFound
 from rig.devices.dynamixel.port import READ_SLICE_S
+from rig.devices.dynamixel.registers import protocol_of
 from sim.camera import SimCapture
 from sim.head.board import PinChange, SimHead
 from sim.head.serial_port import HeadSerial
@@ -20,8 +21,32 @@ from sim.imu.inertial import SimulatedImu
 from sim.objects.projection import Image
 from sim.objects.shelf import shelf
 from sim.servo import ServoBus, SimSerial
-from sim.servo.configured import SimulatedServo, simulated_servo
+from sim.servo.ax12 import AX_12A, Ax12Servo
+from sim.servo.device import XSeriesServo
+from sim.servo.models import servo_model
+from sim.servo.shaft import Geared, Shaft
 from sim.world import SimObject, World
+
+SimulatedServo = XSeriesServo | Ax12Servo
+
+
+def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
+    """Return the servo that ``config`` describes, with factory settings, on the table's shaft or behind its gear.
+
+    Raises `ConfigError` if there is no simulated servo of that model, or the model does not have the baud rate.
+    """
+    shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
+    try:
+        if protocol_of(config.model) == 1:
+            model = AX_12A if config.model == AX_12A.name else servo_model(config.model)
+            return Ax12Servo(shaft, model, bus_id=config.id, baudrate=config.baud)
+        return XSeriesServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
+    except ValueError as error:
+        raise ConfigError(
+            "The simulated bench has no such servo.",
+            next_step="Correct servo.model or servo.baud.",
+            evidence={"reason": str(error)},
+        ) from error
 
 
 @dataclass

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.devices import SimDevices
+from sim.devices import SimDevices, SimulatedServo
 from sim.faults.kind import Delay, End, Parameter, repeatedly, share, simulated_fault
 from sim.servo import Ax12Servo, SentBytes, XSeriesServo
 from sim.servo.base import OVERLOAD_ERROR
-from sim.servo.configured import SimulatedServo
 from sim.servo.control_table import Memory
 from sim.world import World
 

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from rig.config import ServoConfig
+from sim.devices import simulated_servo
 from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
 from sim.servo import ServoBus, SimSerial
-from sim.servo.configured import simulated_servo
 from sim.world import World
 from tests.programs import Program
 
