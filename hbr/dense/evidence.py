@@ -12,6 +12,7 @@ text-independent speaker verification systems", Digital Signal Processing 10, 20
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, IndexArray
@@ -25,7 +26,10 @@ _COHORT: Final = 10  # more: less noise, and less similar objects, whose similar
 _NEXT: Final = 3
 
 #: The number of numbers that do not depend on the parts of the descriptor; they come first.
-COMMON: Final = 5
+COMMON: Final = 7
+#: No search had enrolled views nearer to each other, or more queries, when the weights were fitted.
+_LEAST_APART_DEG: Final = 10.0
+_MOST_QUERIES: Final = 4.0
 #: A candidate is a near twin of the leader if its z of the leader's own view is at least this share of the leader's.
 # twins on the simulated bench have 0.99 from the sides where they look the same; different cups, apples or cars 0.75
 _TWIN_FROM: Final = 0.9
@@ -34,7 +38,7 @@ _LEAST_LEAD: Final = 0.5
 
 
 def numbers(belief: Belief, leader: int) -> FloatArray:
-    """Return the numbers for the object at a place of the belief's index, float64 (5 + 2 p,), of p uses of parts.
+    """Return the numbers for the object at a place of the belief's index, float64 (7 + 2 p,), of p uses of parts.
 
     A lead is by how much z exceeds the mean z of a cohort, the next candidates; it is a mean over the queries, by their
     weights. The numbers are:
@@ -43,30 +47,22 @@ def numbers(belief: Belief, leader: int) -> FloatArray:
     - the lead, relative to the lead that the two enrolled views beside the estimated azimuth have among each other,
     - the logarithms of the lead that is expected of a view between these two, and of the same over the best of the
       cohort instead of its mean: how different the leader is from the cohort,
+    - the logarithms of the mean distance of the leader's enrolled views in degrees, and of the number of queries,
     - the lead of each use of a part, and its z.
 
     A near twin of the leader, which looks the same from the sides that were seen, is no other candidate: it says
     nothing about objects that are not enrolled. Without another candidate, the others have z = 0.
     """
     index, space = belief.index, belief.index.space
+    weights = np.ones(belief.queries) if belief.weights is None else belief.weights
+    share = weights / weights.sum()
     best = belief.support.max(axis=1) / belief.amount
     order = np.argsort(-best, kind="stable")
     places: IndexArray = np.concatenate([[leader], order[order != leader][:_COHORT]])
-    seen_deg = belief.support[places].argmax(axis=1)[:, None] * BIN_DEG + (
-        belief.orientation_deg - belief.orientation_deg[0]
-    )
-    rows = index.nearest_views(places, seen_deg, _NEXT)
-    away_deg = size_deg(index.views.azimuth_deg[rows[0, :, :2]] - seen_deg[0, :, None])
-    uses = np.empty((belief.queries, len(places), len(space.begin)))
-    profiles = np.empty((belief.queries, len(places)))
-    between = np.empty(belief.queries)
-    for n, query in enumerate(belief.vectors):
-        near = index.vectors[rows[:, n]]
-        uses[n] = _uses(query, near, space.begin) - space.usual
-        profiles[n], between[n] = _expected(near, away_deg[n], float(space.usual.sum()))
-    weights = np.ones(belief.queries) if belief.weights is None else belief.weights
-    share = weights / weights.sum()
-    each, profile = np.einsum("n,nmp->mp", share, uses), share @ profiles
+    rows, away_deg = _views_at_pose(belief, places)
+    uses = [_uses(query, index.vectors[rows[:, n]], space.begin) for n, query in enumerate(belief.vectors)]
+    each: FloatArray = np.einsum("n,nmp->mp", share, uses) - space.usual
+    profile, between = _profile(belief, share, rows, away_deg)
     is_other = profile < _TWIN_FROM * profile[0]
     is_other[0] = False
     if is_other.any():
@@ -77,10 +73,41 @@ def numbers(belief: Belief, leader: int) -> FloatArray:
         most = mean = expected_most = expected_mean = others = 0.0
     lead = best[leader] - mean
     expected = np.maximum(
-        [share @ between - expected_mean, profile[0] - expected_mean, profile[0] - expected_most], _LEAST_LEAD
+        [between - expected_mean, profile[0] - expected_mean, profile[0] - expected_most], _LEAST_LEAD
     )
+    apart_deg = max(360 / len(index.rows_of(leader)), _LEAST_APART_DEG)
+    queries = min(max(belief.amount, 1.0), _MOST_QUERIES)
     common = [lead, (best[leader] - most) / max(lead, _LEAST_LEAD), lead / expected[0], *np.log(expected[1:])]
-    return np.array([*common, *(each[0] - others), *each[0]])
+    return np.array([*common, *np.log([apart_deg, queries]), *(each[0] - others), *each[0]])
+
+
+def near_twins(belief: Belief, leader: int, places: IndexArray) -> NDArray[np.bool_]:
+    """Return which objects, at some places of the belief's index, look like the leader in the views so far."""
+    share = np.full(belief.queries, 1 / belief.queries)
+    profile, _ = _profile(belief, share, *_views_at_pose(belief, np.concatenate([[leader], places])))
+    found: NDArray[np.bool_] = profile[1:] >= _TWIN_FROM * profile[0]
+    return found
+
+
+def _views_at_pose(belief: Belief, places: IndexArray) -> tuple[IndexArray, FloatArray]:
+    """Return the enrolled views nearest to the likeliest pose of some objects, by query, (m, n, k).
+
+    The distances of the first object's two nearest ones are (n, 2), in degrees.
+    """
+    index = belief.index
+    seen_deg = belief.support[places].argmax(axis=1)[:, None] * BIN_DEG + (
+        belief.orientation_deg - belief.orientation_deg[0]
+    )
+    rows = index.nearest_views(places, seen_deg, _NEXT)
+    return rows, size_deg(index.views.azimuth_deg[rows[0, :, :2]] - seen_deg[0, :, None])
+
+
+def _profile(belief: Belief, share: FloatArray, rows: IndexArray, away_deg: FloatArray) -> tuple[FloatArray, float]:
+    """Return the means of `_expected` over the queries, by their shares."""
+    usual, vectors = float(belief.index.space.usual.sum()), belief.index.vectors
+    each = [_expected(vectors[rows[:, n]], away_deg[n], usual) for n in range(belief.queries)]
+    profile: FloatArray = share @ [one for one, _ in each]
+    return profile, float(share @ [between for _, between in each])
 
 
 def _uses(query: Floats, near: Floats, begin: IndexArray) -> FloatArray:

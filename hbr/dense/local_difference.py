@@ -394,17 +394,23 @@ class Pixels:
 
 
 class PixelFit(NamedTuple):
-    """The fit of a leader to the views of a search, at most 1.
+    """The fit of the leading candidates of a search to its views, at most 1.
 
     Attributes
     ----------
-    own, others : float
-        Mean fit of the leader and of the next candidates.
+    object_index : int
+        The leader, after the comparison, as an index of the views' names.
+    own, second : float
+        Mean fit of the leader, and of the other one of the two likeliest candidates; 0 without one.
+    others : float
+        The best mean fit of the next candidates that are no near twins of the leader; 0 without one.
     expected : float
         Mean fit of the two enrolled views of the leader beside each view to each other.
     """
 
+    object_index: int
     own: float
+    second: float
     others: float
     expected: float
 

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from hbr.core.angles import size_deg, wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.change import Change, changed
+from hbr.dense.evidence import near_twins
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import (
@@ -41,10 +42,21 @@ from hbr.dense.local_difference import (
 )
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.pose import poses_of
-from hbr.dense.stopping import ERROR_RATE, HOPELESS, Outcome, StopDecision, StopReason, decide
+from hbr.dense.stopping import (
+    ERROR_RATE,
+    HOPELESS,
+    Outcome,
+    StopDecision,
+    StopReason,
+    among_enrolled,
+    decide,
+    pair_odds,
+)
 
 #: Segmentations of each view that are compared.
 _SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of both candidates
+#: Candidates that are compared with the views.
+_COMPARED: Final = 3  # the two leaders, and one more if these are near twins
 #: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search.
 _NOT_WORTH_A_FIT: Final = 0.95
 #: Share of the probability that the two leaders have together.
@@ -94,14 +106,7 @@ def near(own_deg: ArrayLike, azimuths_deg: Sequence[float]) -> IndexArray:
     return places
 
 
-class Verification(NamedTuple):
-    """The fit of the leader's enrolled views to the views of a search; the leader is an index of the views' names."""
-
-    object_index: int
-    fit: PixelFit
-
-
-class _Fits:
+class Fits:
     """The fits of a search, and the enrolled views that they need; each is measured, and asked for, once."""
 
     def __init__(self) -> None:
@@ -148,16 +153,17 @@ class _Fits:
         return self._enrolled[key]
 
 
-def verify(belief: Belief, queries: Queries, fits: _Fits | None = None) -> Asking[Verification | None]:
-    """Compare the views of a search with the enrolled views of its two leading candidates; None without such views.
+def verify(belief: Belief, queries: Queries, fits: Fits | None = None) -> Asking[PixelFit | None]:
+    """Compare the views of a search with the enrolled views of its leading candidates; None without such views.
 
     The queries are in the order of the belief's.
     """
-    fits = fits or _Fits()
+    fits = fits or Fits()
     last_deg = float(belief.orientation_deg[-1])
-    order = np.argsort(-belief.probability(), kind="stable")[:2]
-    means, expected = [], 0.0
-    for candidate in belief.index.object_index[order].tolist():
+    places: IndexArray = np.argsort(-belief.probability(), kind="stable")[:_COMPARED]
+    candidates = belief.index.object_index[places].tolist()
+    means, beside = [], []
+    for candidate in candidates:
         pose_deg, *_ = poses_of(belief, candidate)
         azimuths_deg = [wrap360(pose_deg + o - last_deg) for o in belief.orientation_deg.tolist()]
         own_deg = belief.index.views.azimuth_deg[belief.index.views.of(candidate)]
@@ -168,10 +174,15 @@ def verify(belief: Belief, queries: Queries, fits: _Fits | None = None) -> Askin
         nearest = [[views[place] for place in _nearest(enrolled_deg, deg).tolist()] for deg in azimuths_deg]
         best = [max(fits.of_view(n, queries, candidate, one) for one in near) for n, near in enumerate(nearest)]
         means.append(float(np.mean(best)))
-        if len(means) == 1:  # what a view between two enrolled ones has at least
-            expected = float(np.mean([fits.of_pair(candidate, near[0], near[-1]) for near in nearest]))
-    leader = int(belief.index.object_index[order[0]])
-    return Verification(leader, PixelFit(means[0], means[1] if len(means) > 1 else 0.0, expected))
+        beside.append(nearest)
+    # the second candidate leads if it fits better
+    leader = 1 if len(candidates) > 1 and pair_odds(belief, places[0], places[1], means[0] - means[1]) < 0 else 0
+    is_other = ~near_twins(belief, int(places[leader]), places)
+    others = [mean for mean, other in zip(means, is_other.tolist(), strict=True) if other]
+    # what a view between two enrolled ones has at least
+    expected = np.mean([fits.of_pair(candidates[leader], near[0], near[-1]) for near in beside[leader]])
+    second = means[1 - leader] if len(candidates) > 1 else 0.0
+    return PixelFit(candidates[leader], means[leader], second, max(others, default=0.0), float(expected))
 
 
 def _nearest(own_deg: FloatArray, azimuth_deg: float) -> IndexArray:
@@ -287,7 +298,7 @@ class DenseSession:
         What the decision would be after the last view, if there was one after each.
     is_new_decision : bool
         Whether the last view led to a decision.
-    verification : Verification, optional
+    verification : PixelFit, optional
         The fit of the leader after the last view, if it was measured.
     comparison : LeaderComparison, optional
         The comparison of the two leaders after the last view, if there was one.
@@ -297,7 +308,7 @@ class DenseSession:
     decision: StopDecision
     present: StopDecision
     is_new_decision = True
-    verification: Verification | None = None
+    verification: PixelFit | None = None
     comparison: LeaderComparison | None = None
     left_out = 0
     change: Change | None = None
@@ -315,7 +326,7 @@ class DenseSession:
         self._queries: list[LevelArray] = []
         self._disturbed: set[int] = set()
         self._reliable, self._other_bench = True, False
-        self._fits = _Fits()
+        self._fits = Fits()
 
     def add(
         self,
@@ -384,7 +395,7 @@ class DenseSession:
 
     def _forget_queries(self) -> None:
         self._so_far, self._index, self._closest = self._all, self._all, None
-        self._queries, self._fits = [], _Fits()
+        self._queries, self._fits = [], Fits()
         self._before.clear()
 
     def _begin_view(self, orientation_deg: float) -> None:
@@ -443,6 +454,10 @@ class DenseSession:
         """Return the rotation to the next best view, as `hbr.next_best_view` does."""
         return next_best_view(self.belief, rotations_deg=rotations_deg, seconds=seconds)
 
+    def among_enrolled(self) -> FloatArray:
+        """Return the probability of every object considered if the object on the table is enrolled, (k,)."""
+        return among_enrolled(self.belief, self.verification)
+
     def end(self) -> StopDecision:
         """Return the decision with which the search ends here, even if it would continue.
 
@@ -453,7 +468,7 @@ class DenseSession:
             decision = self._decide(last=True)
         return decision if self.comparison is None else self.comparison.decided(decision)
 
-    def verify(self, queries: Queries, measured: Verification | None = None) -> Asking[Verification | None]:
+    def verify(self, queries: Queries, measured: PixelFit | None = None) -> Asking[PixelFit | None]:
         """Compare the leader with the views pixel by pixel, and decide again; None if that is not worth its time.
 
         A fit that was ``measured`` before is used instead of enrolled views.
@@ -481,5 +496,10 @@ class DenseSession:
 
     def _decide(self, *, last: bool = False) -> StopDecision:
         last = last or self.belief.queries >= self.max_views
-        fit = None if self.verification is None else self.verification.fit
-        return decide(self.belief, last=last, reliable=self._reliable, fit=fit, other_bench=self._other_bench)
+        return decide(
+            self.belief,
+            last=last,
+            reliable=self._reliable,
+            fit=self.verification,
+            other_bench=self._other_bench,
+        )

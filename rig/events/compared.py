@@ -19,7 +19,7 @@ Image = Annotated[NDArray[np.uint8], NO_JSON, Field(exclude=True, default=np.emp
 class Verified:
     """The enrolled views of the two leading candidates were compared with the views so far, pixel by pixel.
 
-    A replay does not repeat this comparison: it uses the saved ``fit``, ``others`` and ``expected``.
+    A replay does not repeat this comparison: it uses the saved ``fit``, ``second``, ``others`` and ``expected``.
     """
 
     event: Literal["verified"] = field(default="verified", init=False)
@@ -29,8 +29,10 @@ class Verified:
     """Name of the leading candidate."""
     fit: float
     """Share of the views' contrast that the enrolled views of this candidate explain, at most 1."""
-    others: float
+    second: float
     """The same share for the second candidate, at most 1; 0 without one."""
+    others: float
+    """The best of these shares for the next candidates that are no near twins of this one, at most 1; 0 without one."""
     expected: float
     """Share of the contrast that two neighbouring enrolled views of this candidate explain of each other, at most 1."""
     outcome: Outcome

@@ -119,10 +119,10 @@ def ranking_words(ranked: Ranked | None) -> str:
 
 def verification_words(verified: Verified) -> str:
     """Return what the comparison of the leading candidate with the views found, as a sentence without its full stop."""
-    own, others, expected = map(percent_words, (verified.fit, verified.others, verified.expected))
+    own, second, expected = map(percent_words, (verified.fit, verified.second, verified.expected))
     return (
         f"compared with {verified.name} pixel by pixel: its enrolled views explain {own} of the contrast (of each "
-        f"other {expected}), those of the second candidate {others}; it is {verified.name} with "
+        f"other {expected}), those of the second candidate {second}; it is {verified.name} with "
         f"{percent_words(verified.probability)}, and not enrolled with {percent_words(verified.not_enrolled)}"
     )
 

@@ -6,7 +6,7 @@ from math import isclose
 from typing import Any, Final
 
 from hbr.dense.local_difference import PixelFit
-from hbr.dense.session import Verification, answered
+from hbr.dense.session import answered
 from rig.core.json_form import plain
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
@@ -108,9 +108,8 @@ def check(run: SavedRun) -> ReplayCheck:
                 computed = _decided(search, event)
             case Verified():
                 # the enrolled images are not in the run, so their measured fit is used
-                measured = Verification(
-                    search.names.index(event.name), PixelFit(event.fit, event.others, event.expected)
-                )
+                leader = search.names.index(event.name)
+                measured = PixelFit(leader, event.fit, event.second, event.others, event.expected)
                 computed = answered(search.verify((), measured))
             case Compared():
                 views = saved_enrolled_views(event, search.names)

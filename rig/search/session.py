@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.angles import wrap360
 from hbr.dense.arc import ArcSession
-from hbr.dense.local_difference import LocalView, ViewDifference
+from hbr.dense.local_difference import LocalView, PixelFit, ViewDifference
 from hbr.dense.pose import pose, poses_of
-from hbr.dense.session import Asking, LeaderComparison, Queries, Verification
+from hbr.dense.session import Asking, LeaderComparison, Queries
 from hbr.model.symmetry import symmetry
 from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from rig.config import RigConfig
@@ -242,7 +242,7 @@ class Search(ABC):
         """Return the event if the last view shows that the object changed; the search has then begun again."""
         return None
 
-    def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:  # noqa: ARG002
+    def verify(self, hypotheses: Hypotheses, measured: PixelFit | None = None) -> Asking[Verified | None]:  # noqa: ARG002
         """Compare the last views with the leader's, as `hbr.DenseSession.verify`; the decision depends on it."""
         return _no_step()
 
@@ -462,7 +462,7 @@ class DenseSearch(Search):
     def _rank(self) -> Ranked:
         belief = self._session.belief
         self._scores = belief.scores()
-        self._order = np.lexsort((-self._scores, -belief.probability()))
+        self._order = np.lexsort((-self._scores, -self._session.among_enrolled()))
         candidates = self._candidates()
         others = float(self._scores[self._order[1:]].max(initial=0.0))
         return Ranked(len(self._orientations) - 1, candidates, candidates[0].score - others, self._session.decision)
@@ -479,7 +479,7 @@ class DenseSearch(Search):
 
     def _probability(self) -> NDArray[np.float64]:
         """Return the probability of each object considered; what is missing to 1 is that of "not enrolled"."""
-        return self._session.belief.probability() * (1 - self._session.decision.not_enrolled)
+        return self._session.among_enrolled() * (1 - self._session.decision.not_enrolled)
 
     def changed(self) -> ObjectChanged | None:
         change = self._session.change
@@ -506,7 +506,7 @@ class DenseSearch(Search):
             rng=self._rng,
         )
 
-    def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:
+    def verify(self, hypotheses: Hypotheses, measured: PixelFit | None = None) -> Asking[Verified | None]:
         found = yield from self._session.verify(self._queries(hypotheses), measured)
         if found is None:
             return None
@@ -514,9 +514,10 @@ class DenseSearch(Search):
         return Verified(
             index=len(self._orientations) - 1,
             name=self.names[found.object_index],
-            fit=found.fit.own,
-            others=found.fit.others,
-            expected=found.fit.expected,
+            fit=found.own,
+            second=found.second,
+            others=found.others,
+            expected=found.expected,
             outcome=decision.outcome,
             probability=decision.probability,
             not_enrolled=decision.not_enrolled,

@@ -8,7 +8,7 @@ from hbr.dense.evidence import COMMON, numbers
 from tests.hbr.dense.searches import LIGHT, belief_after, catalog, view
 
 QUERIES_DEG = (30.0, 150.0, 270.0)
-LEAD, SECOND, BETWEEN, EXPECTED, EXPECTED_OVER_BEST = range(COMMON)
+LEAD, SECOND, BETWEEN, EXPECTED, EXPECTED_OVER_BEST, APART, QUERIES = range(COMMON)
 
 
 def search(index: DenseIndex, share: float, j: int = 2) -> np.ndarray:

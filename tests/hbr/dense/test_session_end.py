@@ -10,7 +10,7 @@ import hbr
 from hbr import Outcome, StopReason
 from hbr.dense.arc import ArcSession
 from hbr.dense.local_difference import LocalView, PixelFit
-from hbr.dense.session import NeedEnrolledViews, Verification, answered, compare_leaders
+from hbr.dense.session import NeedEnrolledViews, answered, compare_leaders
 from hbr.dense.stopping import ERROR_RATE, decide
 from tests.hbr.dense.searches import catalog, found_from
 from tests.hbr.dense.test_local_difference import shown
@@ -112,9 +112,9 @@ def test_a_search_at_rest_is_verified_unless_its_object_is_hardly_enrolled(sessi
 def test_a_measured_fit_replaces_the_enrolled_views(session) -> None:
     found = []
     for own in (0.1, 0.5, 0.9):
-        measured = Verification(session.end().object_index, PixelFit(own, 0.3, 0.8))
+        measured = PixelFit(session.end().object_index, own, 0.3, 0.3, 0.8)
         assert answered(session.verify(lambda _: pytest.fail("no view is needed"), measured)) is measured
-        assert session.decision == session.present == decide(session.belief, last=True, fit=measured.fit)
+        assert session.decision == session.present == decide(session.belief, last=True, fit=measured)
         found.append(session.end().not_enrolled)
     assert found == sorted(found, reverse=True)
     session.add(session.belief.index.views.levels(np.array([0]))[0], 0.0)
@@ -125,9 +125,9 @@ def test_a_good_fit_ends_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
     index = hbr.DenseIndex(catalog(objects=4))
     session = hbr.DenseSession(index)
     session.add(index.views.levels(np.array([0]))[0], 0.0)
-    with_fit = decide(session.belief, last=False, fit=PixelFit(0.95, 0.2, 0.9)).probability
+    with_fit = decide(session.belief, last=False, fit=PixelFit(0, 0.95, 0.2, 0.2, 0.9)).probability
     found_from(monkeypatch, with_fit)
     session = hbr.DenseSession(index)
     assert session.add(index.views.levels(np.array([0]))[0], 0.0).outcome is Outcome.CONTINUE
-    answered(session.verify(lambda _: [], Verification(0, PixelFit(0.95, 0.2, 0.9))))
+    answered(session.verify(lambda _: [], PixelFit(0, 0.95, 0.2, 0.2, 0.9)))
     assert session.decision.outcome is session.end().outcome is Outcome.FOUND

@@ -12,7 +12,7 @@ from tests.fuzzing import examples
 from tests.hbr.dense.searches import LIGHT, belief_after, catalog, view
 
 QUERIES_DEG = (30.0, 150.0, 270.0, 330.0)
-GOOD, BAD = PixelFit(0.9, 0.3, 0.85), PixelFit(0.3, 0.3, 0.85)
+GOOD, BAD = PixelFit(0, 0.9, 0.3, 0.3, 0.85), PixelFit(0, 0.3, 0.3, 0.3, 0.85)
 INDEX = DenseIndex(catalog(12))
 STRANGE = catalog(3, seed=9)
 
@@ -104,7 +104,7 @@ def test_a_more_similar_object_is_more_probable(count: int) -> None:
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
 def test_a_better_fit_raises_the_probability(share: float) -> None:
     belief = search(share)
-    fits = [PixelFit(own, 0.3, 0.85) for own in (0.3, 0.5, 0.7, 0.9)]
+    fits = [PixelFit(2, own, 0.3, 0.3, 0.85) for own in (0.3, 0.5, 0.7, 0.9)]
     probabilities = [decide(belief, last=True, fit=one).probability for one in fits]
     assert probabilities == sorted(probabilities)
     # the fit changes the probability of "not enrolled", and not which object leads

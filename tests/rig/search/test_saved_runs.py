@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hbr
+from hbr.dense import stopping
 from rig.cli.main import app
 from rig.core.errors import UsageError
 from rig.events.compared import Compared
@@ -35,7 +36,10 @@ from tests.rig.search.run_samples import saved_runs
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    return saved_runs(tmp_path_factory.mktemp("runs"))
+    with pytest.MonkeyPatch.context() as patch:
+        for least in ("MIN_CONFIDENCE", "LAST_CONFIDENCE"):
+            patch.setattr(stopping, least, 1.0)  # no search is sure, so that its two leaders are compared
+        yield saved_runs(tmp_path_factory.mktemp("runs"))
 
 
 def changed(saved, tmp_path: Path, line: int, **values: object) -> Path:
