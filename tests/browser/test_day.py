@@ -33,10 +33,10 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     job_done(page, "Enroll lamp")
     assert page.locator("#thumbs img").count() == 8
     tray = tmp_path / "tray.csv"
-    tray.write_text('name,label,note,views\nmug-star,kitchen,"has a star, red",8\nmug-white,kitchen,,8\n')
+    tray.write_text('name,label,note,views\nmug-star,kitchen,"has a star, red",8\nteapot,kitchen,,8\n')
     page.set_input_files("#file", tray)
     page.click("#tray-start")
-    for name in ("mug-star", "mug-white"):
+    for name in ("mug-star", "teapot"):
         page.wait_for_selector(f".question:has-text('put {name} (kitchen) on the table')", timeout=WAIT_MS)
         page.click(".question button:has-text('Continue')")
     job_done(page, "Enroll a tray")
