@@ -54,7 +54,7 @@ from hbr.dense.stopping import (
 )
 
 #: Segmentations of each view that are compared.
-_SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of both candidates
+_SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of every candidate
 #: Candidates that are compared with the views.
 _COMPARED: Final = 3  # the two leaders, and one more if these are near twins
 #: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search.

@@ -1,9 +1,9 @@
 """The posterior of a search over the enrolled objects and "not enrolled", and the decision that follows from it.
 
 The numbers of `hbr.dense.evidence` give the log-odds that the leading candidate is the object on the table, by a small
-network. The pixel by pixel fit of the leader, and whether the bench is another one, are
-further numbers. What is left is the probability that the object is not enrolled. `Belief` divides the rest among the
-enrolled objects; the fit also counts between the two likeliest ones.
+network. The pixel by pixel fit of the leader, and whether the bench is another one, are further numbers. What is left
+is the probability that the object is not enrolled. `Belief` divides the rest among the enrolled objects; the fit also
+counts between the two likeliest ones.
 
 The weights (``evidence.json``) are the same for all catalogs. `python -m benchmarks.fit_search` fits them to half of
 the objects of COIL-100 and ETH-80, after changes of a drawn bench and in the photographs as they are, with and without
@@ -167,7 +167,7 @@ def decide(
 #: Log-odds are limited to this: 1 in 10,000. No data support a smaller probability.
 _MOST_ODDS: Final = 9.2
 #: Weights of the log-odds of two objects by the belief, and of the difference of their fits.
-# fitted to 2,134 searches of objects 1-50 of COIL-100 and of ETH-80 in which the object is one of the two
+# fitted to 2,134 searches, of all objects of COIL-100 and ETH-80, in which the object is one of the two
 _OF_BELIEF, _OF_FIT = 0.7, 14.0
 _TINY: Final = 1e-12
 

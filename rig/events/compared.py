@@ -17,7 +17,7 @@ Image = Annotated[NDArray[np.uint8], NO_JSON, Field(exclude=True, default=np.emp
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """The enrolled views of the two leading candidates were compared with the views so far, pixel by pixel.
+    """The enrolled views of the leading candidates were compared with the views so far, pixel by pixel.
 
     A replay does not repeat this comparison: it uses the saved ``fit``, ``second``, ``others`` and ``expected``.
     """
@@ -30,7 +30,7 @@ class Verified:
     fit: float
     """Share of the views' contrast that the enrolled views of this candidate explain, at most 1."""
     second: float
-    """The same share for the second candidate, at most 1; 0 without one."""
+    """The same share for the other one of the two likeliest candidates, at most 1; 0 without one."""
     others: float
     """The best of these shares for the next candidates that are no near twins of this one, at most 1; 0 without one."""
     expected: float

@@ -78,7 +78,8 @@ def status(settings: Settings) -> None:
 
     Example: rig status --bench sim --json
     """
-    from rig.jobs.status import bench_report, report_lines
+    from rig.cli.bench.status_words import report_lines
+    from rig.jobs.status import bench_report
 
     report = bench_report(
         settings.load().state_path(settings.bench_name),

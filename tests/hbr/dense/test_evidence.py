@@ -52,6 +52,14 @@ def test_the_expected_leads_hardly_depend_on_the_query() -> None:
     assert own[EXPECTED_OVER_BEST] < own[EXPECTED]
 
 
+@pytest.mark.parametrize("step_deg", [5.0, 30.0, 90.0])
+def test_spacing_of_the_views_and_number_of_queries_count_within_those_of_the_fit(step_deg: float) -> None:
+    index = DenseIndex(catalog(4, step_deg=step_deg))
+    for count in (1, 3, 6):
+        found = numbers(belief_after(index.views.descriptors[[0] * count], [60.0 * n for n in range(count)], index), 0)
+        assert np.exp(found[[APART, QUERIES]]) == pytest.approx([max(step_deg, 10.0), min(count, 4)])
+
+
 def test_the_second_object_has_a_negative_margin() -> None:
     index = DenseIndex(catalog(10))
     belief = belief_after([view(index.views, 2, deg) for deg in QUERIES_DEG], QUERIES_DEG, index)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hbr import Belief, DenseIndex, Outcome, StopReason
 from hbr.dense.local_difference import PixelFit
-from hbr.dense.stopping import LAST_CONFIDENCE, MIN_CONFIDENCE, UNKNOWN_FROM, decide, posterior
+from hbr.dense.stopping import LAST_CONFIDENCE, MIN_CONFIDENCE, UNKNOWN_FROM, among_enrolled, decide, posterior
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import LIGHT, belief_after, catalog, view
 
@@ -92,6 +92,22 @@ def test_two_equal_objects_share_the_probability() -> None:
     probability, _ = posterior(search(0.0, index=index))
     assert probability[2] == pytest.approx(probability[6], rel=1e-3)
     assert decide(search(0.0, index=index), last=True).outcome is not Outcome.FOUND
+
+
+def test_the_better_fit_leads_among_twins() -> None:
+    views = catalog(6)
+    own = views.of(2)
+    twin = type(views).of_object("twin", views.levels(own), views.azimuth_deg[own], views.descriptor)
+    belief = search(0.0, index=DenseIndex(type(views).concatenate([views, twin])))
+    for leader, other in ((2, 6), (6, 2)):
+        shares = [among_enrolled(belief, PixelFit(leader, 0.6 + by, 0.6, 0.2, 0.6)) for by in (0.0, 0.1, 0.3)]
+        assert np.array(shares).sum(axis=1) == pytest.approx(1)
+        leading = [one[leader] for one in shares]
+        assert leading == sorted(leading)
+        assert leading[0] == pytest.approx(shares[0][other], rel=1e-3)
+        assert leading[-1] > 0.95
+        assert decide(belief, last=True, fit=PixelFit(leader, 0.9, 0.6, 0.2, 0.6)).object_index == leader
+        assert np.delete(shares[-1], [2, 6]) == pytest.approx(np.delete(belief.probability(), [2, 6]))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])

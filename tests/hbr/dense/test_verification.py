@@ -1,6 +1,8 @@
 """A doubtful leader is compared with the views of the search: its enrolled views explain their pixels in any light."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -92,3 +94,26 @@ def test_the_leader_is_compared_at_its_pose_with_the_better_segmentation(index: 
     assert found.object_index == 2
     assert found.own > 0.4 > max(found.second, found.others)
     assert found.expected == pytest.approx(1, abs=0.05)  # all views of the object are the same here
+
+
+def test_the_second_candidate_leads_if_it_fits_better_and_a_twin_is_no_other_candidate() -> None:
+    views = catalog()
+    own = views.of(2)
+    twin = Views.of_object("twin", views.levels(own), views.azimuth_deg[own], views.descriptor)
+    both = DenseIndex(Views.concatenate([views, twin]))
+    belief = update_belief(views.levels(own[:1]), float(views.azimuth_deg[own[0]]), both)
+    first, second = np.argsort(-belief.probability(), kind="stable")[:2].tolist()
+    assert {first, second} == {2, len(both) - 1}
+
+    def enrolled(leader: int, azimuths_deg: Sequence[float], shown_as: Mapping[int, int]) -> list[LocalView]:
+        view = painted(shown_as.get(leader, leader))
+        return [replace(view, azimuth_deg=azimuth_deg) for azimuth_deg in azimuths_deg]
+
+    for better in (first, second):
+        found = answered(verify(belief, lambda _: [painted(better)]), partial(enrolled, shown_as={}))  # noqa: B023
+        assert found is not None
+        assert found.object_index == better
+        assert found.own > 0.9 > found.second
+    same = answered(verify(belief, lambda _: [painted(first)]), partial(enrolled, shown_as={second: first}))
+    assert same is not None
+    assert same.second > 0.9 > same.others
