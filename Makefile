@@ -20,7 +20,7 @@ help:
 	@echo "make test-kills  kill the program at a hundred points of its work, and check the stored data"
 	@echo "make test-web   test the pages in a real browser, and attack the server"
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
-	@echo "make test-servers  test PostgreSQL, S3, Dask and bluesky with real servers"
+	@echo "make test-servers  test PostgreSQL, S3 and bluesky with real servers"
 	@echo "make fuzz   attack every kind of input, 5 to 45 minutes (a part of test-nightly)"
 	@echo "make lint   check formatting, lint, types and import contracts"
 	@echo "make docs   build the documentation as a site in site/"
@@ -98,7 +98,7 @@ lock:
 	printf 'hatchling\neditables\n' | uv pip compile - pyproject.toml --constraint requirements.lock --universal --python-version 3.11 \
 	    --generate-hashes --no-header --no-emit-index-url -o .ci/core.lock
 	for tool in uv:uv setuptools:backend cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
-	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] distributed bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
+	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
 

@@ -68,7 +68,6 @@ def answers(folder: Path, objects: int) -> None:
     for words, until in (
         ("catalog list", "the end"),
         (f"catalog show {shlex.quote(name)}", "the end"),
-        ("catalog stats", "the end"),
         ("identify --json --set identify.max_views=2", "the first ranking"),
     ):
         runs = sorted(run(home, shlex.split(words), first_ranking="first" in until) for _ in range(3))

@@ -10,30 +10,25 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from math import degrees, sqrt
+from math import degrees
 from typing import Any
 
 import cv2
 import numpy as np
 
-from calibration import camera_light, camera_model, table_axis
+from calibration import camera_model, table_axis
 from calibration.procedures import (
     Backlash,
-    CameraCard,
     CameraModel,
-    CameraNoise,
     CameraTime,
     Encoder,
-    GyroNoise,
     GyroScale,
     ImuMounting,
-    MotionModel,
     TableAxis,
 )
 from rig.calibrations import CalibrationResult
 from rig.config import load_config
 from rig.core.phrases import in_unit
-from rig.motion.turntable import Turntable
 from rig.views.charuco_board import CharucoBoard
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.calibration_board import boards
@@ -64,21 +59,6 @@ def imu_scale(seed: int) -> tuple[CalibrationResult, Truth]:
         return last(GyroScale(8).live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
 
 
-def imu_noise(seed: int) -> tuple[CalibrationResult, Truth]:
-    rng = np.random.default_rng(seed)
-    noise = NoiseModel(
-        gyro_noise_dps_rthz=float(rng.uniform(0.003, 0.015)), gyro_bias_walk_dps_rts=float(rng.uniform(1e-4, 1e-3))
-    )
-    with opened(seed, noise) as (bench, parts):
-        slope = float(parts.imu.inertial.gyro_slope_dps_c[2])
-        truth = {
-            "angle_random_walk": (noise.gyro_noise_dps_rthz / sqrt(2), "°/√s"),
-            "rate_random_walk": (noise.gyro_bias_walk_dps_rts, "°/s/√s"),
-            "bias_slope": (slope, "°/s/°C"),
-        }
-        return last(GyroNoise(20.0).live(bench)), truth
-
-
 def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed) as (bench, parts):
         part = parts.imu.inertial
@@ -100,51 +80,6 @@ def encoder(seed: int) -> tuple[CalibrationResult, Truth]:
         (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
         # The angle 0 of the servo is 180° from that of the shaft, so odd harmonics change their sign.
         return result, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
-
-
-def motion(seed: int) -> tuple[CalibrationResult, Truth]:
-    rng = np.random.default_rng(seed)
-    speed, ramp = rng.uniform(40, 120), rng.uniform(100, 500)
-    with opened(seed, None, f"table.velocity_dps={speed}", f"table.acceleration_dps2={ramp}") as (bench, _):
-        result = last(MotionModel(3).live(bench))
-        with Turntable(bench) as table:
-            profile = table._profile
-        assert profile is not None
-        return result, {
-            "pace": (1 / profile.velocity_dps, "s/°"),
-            "wind_up": (profile.velocity_dps / profile.acceleration_dps2, "s"),
-        }
-
-
-def light(seed: int) -> NoiseModel:
-    rng = np.random.default_rng(seed)
-    return NoiseModel(
-        full_well_e=float(rng.uniform(4e3, 2e4)),
-        read_noise_e=float(rng.uniform(8, 40)),
-        vignetting=float(rng.uniform(0, 0.3)),
-        light_flicker=float(rng.uniform(0.001, 0.01)),
-    )
-
-
-def photons(seed: int) -> tuple[CalibrationResult, Truth]:
-    noise = light(seed)
-    with opened(seed, noise) as (bench, _):
-        result = last(CameraNoise().live(bench))
-    return result, {"full_well_e": (noise.full_well_e, "electrons"), "read_noise_e": (noise.read_noise_e, "electrons")}
-
-
-def card(seed: int, name: str, truth: Truth) -> tuple[CalibrationResult, Truth]:
-    with opened(seed, light(seed)) as (bench, _):
-        events = [*CameraCard().live(bench)]
-    return next(event for event in events if isinstance(event, CalibrationResult) and event.name == name), truth
-
-
-def corners(seed: int) -> tuple[CalibrationResult, Truth]:
-    return card(seed, camera_light.FLAT_FIELD, {"vignetting": (light(seed).vignetting, "")})
-
-
-def steadiness(seed: int) -> tuple[CalibrationResult, Truth]:
-    return card(seed, camera_light.DRIFT, {"flicker": (light(seed).light_flicker, ""), "drift": (0.0, "%/min")})
 
 
 def lens(seed: int) -> tuple[CalibrationResult, Truth]:
@@ -192,13 +127,8 @@ def frame_time(seed: int) -> tuple[CalibrationResult, Truth]:
 PROCEDURES: dict[str, Callable[[int], tuple[CalibrationResult, Truth]]] = {
     "servo.backlash": backlash,
     "servo.encoder": encoder,
-    "servo.motion": motion,
     "imu.scale": imu_scale,
     "imu.mounting": mounting,
-    "imu.noise": imu_noise,
-    "camera.noise": photons,
-    "camera.flat_field": corners,
-    "camera.drift": steadiness,
     "camera.intrinsics": lens,
     "table.axis": axis,
     "camera.time": frame_time,

@@ -3,7 +3,7 @@
 python -m benchmarks.large_catalog FOLDER [OBJECTS] [--images]
 
 All objects have the same records, with descriptors of their own, and all views the same black image. With ``--images``
-each view shows one of four objects of the simulator in 320x240, for `rig catalog verify` and `redescribe`.
+each view shows one of four objects of the simulator in 320x240, for `rig catalog verify`.
 """
 
 import argparse
@@ -165,11 +165,9 @@ def _describe(catalog: Catalog, views: Views) -> None:
                 if kind.name == PAPER_DESCRIPTOR:
                     packed = kind.pack_rows(views.descriptors[own])
                 content = describing.content_of(kind, packed, views.azimuth_deg[own])
-                transaction.execute(insert(Derived).values(describing.row_of(one.seal, kind.name, None, content)))
+                transaction.execute(insert(Derived).values(describing.row_of(one.seal, kind.name, content)))
             evidence = json.dumps([{}] * VIEWS_OF_AN_OBJECT).encode()
-            transaction.execute(
-                insert(Derived).values(describing.row_of(one.seal, describing.SEGMENTATION, None, evidence))
-            )
+            transaction.execute(insert(Derived).values(describing.row_of(one.seal, describing.SEGMENTATION, evidence)))
 
 
 def _frames() -> list[list[NDArray[np.uint8]]]:

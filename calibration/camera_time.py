@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera_light import BOARD
 from calibration.procedure import Ask, Evaluation, Measured, Procedure, lower_end, returning
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -38,6 +37,7 @@ from rig.motion.turntable import Turntable
 from rig.views.description import within
 
 NAME = "camera.time"
+BOARD = "calibration-board upright"
 
 ARC_DEG = 50.0  # longer: more frames of each pass; shorter: more benches have room for it within the cable budget
 RAMP_S = 0.25

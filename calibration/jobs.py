@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 MARKER_SHARE = 11 / 15
 """Side of a marker over that of its square, on every printed board."""
 
-Minutes = Annotated[float, typer.Option(help="Minutes of recording the gyro at rest.")]
 BoardColumns = Annotated[int, typer.Option(min=3, max=20, help="Squares across the board.")]
 BoardRows = Annotated[int, typer.Option(min=3, max=20, help="Squares down the board.")]
 SquareMm = Annotated[float, typer.Option(min=2, max=100, help="Side of a square in mm, measured on the print.")]
@@ -68,17 +67,16 @@ def _titled(title: str = "") -> "Callable[[Callable[..., Sequence[Procedure]]], 
 def servo(
     reversals: Annotated[int, typer.Option(help="Reversals for the backlash.")] = 24,
     revolutions: Annotated[int, typer.Option(help="Revolutions for the encoder.")] = 2,
-    rounds: Annotated[int, typer.Option(help="Rounds of timed rotations.")] = 3,
 ) -> "Sequence[Procedure]":
-    """Calibrate direction, gear ratio, backlash, encoder and motion of the servo.
+    """Calibrate direction, gear ratio, backlash and encoder of the servo.
 
     Takes some minutes. Exit code 6 if a calibration does not pass.
 
     Example: rig calibrate servo --bench sim
     """
-    from calibration.procedures import Backlash, Encoder, MotionModel
+    from calibration.procedures import Backlash, Encoder
 
-    return Backlash(reversals), Encoder(revolutions), MotionModel(rounds)
+    return Backlash(reversals), Encoder(revolutions)
 
 
 @_titled()
@@ -92,32 +90,31 @@ def cable() -> "Sequence[Procedure]":
     return (Cable(),)
 
 
-@_titled("IMU (half an hour)")
+@_titled("IMU (minutes)")
 def imu(
     revolutions: Annotated[int, typer.Option(help="Least number of revolutions, both directions together.")] = 8,
-    minutes: Minutes = 20.0,
     repeats: Annotated[int, typer.Option(help="Repeated rotations at each speed, to verify σ.")] = 10,
 ) -> "Sequence[Procedure]":
-    """Calibrate scale, mounting and noise of the gyro, and verify the uncertainty of rotations.
+    """Calibrate scale and mounting of the gyro, and verify the uncertainty of rotations.
 
-    Takes half an hour. Exit code 6 if a calibration does not pass.
+    Takes some minutes. Exit code 6 if a calibration does not pass.
 
     Example: rig calibrate imu --bench sim --revolutions 12
     """
-    from calibration.procedures import GyroNoise, GyroRotation, GyroScale, ImuMounting
+    from calibration.procedures import GyroRotation, GyroScale, ImuMounting
 
-    return GyroScale(revolutions), ImuMounting(), GyroNoise(minutes), GyroRotation(repeats)
+    return GyroScale(revolutions), ImuMounting(), GyroRotation(repeats)
 
 
-@_titled("Camera (card and board)")
+@_titled("Camera (board)")
 def camera(columns: BoardColumns = 8, rows: BoardRows = 6, square_mm: SquareMm = 15.0) -> "Sequence[Procedure]":
-    """Calibrate sharpness, noise, flat field, drift and lens of the camera, with a grey card and the printed board.
+    """Calibrate the lens of the camera with the printed board.
 
     Example: rig calibrate camera --bench sim
     """
-    from calibration.procedures import CameraCard, CameraModel, CameraNoise
+    from calibration.procedures import CameraModel
 
-    return CameraNoise(), CameraCard(), CameraModel(_board(columns, rows, square_mm))
+    return (CameraModel(_board(columns, rows, square_mm)),)
 
 
 @_titled("Table axis (board)")
@@ -193,7 +190,6 @@ def noise(
 
 @_titled()
 def everything(
-    minutes: Minutes = 20.0,
     columns: BoardColumns = 8,
     rows: BoardRows = 6,
     square_mm: SquareMm = 15.0,
@@ -206,16 +202,16 @@ def everything(
         typer.Option("--object", metavar="NAME", help="Object for the similarity of repeated views, measured last."),
     ] = None,
 ) -> "Sequence[Procedure]":
-    """Calibrate servo and IMU, which need no operator, then camera and table, with card and board.
+    """Calibrate servo and IMU, which need no operator, then camera and table, with the board.
 
-    Takes about an hour, and stops at the first calibration that does not pass. Calibrate the cable before, and repeated
-    views afterwards if no object is given.
+    Takes about half an hour, and stops at the first calibration that does not pass. Calibrate the cable before, and
+    repeated views afterwards if no object is given.
 
     Example: rig calibrate all --bench sim --object mug-star
     """
     return (
         *servo.procedures(),
-        *imu.procedures(minutes=minutes),
+        *imu.procedures(),
         *camera.procedures(columns, rows, square_mm),
         *table.procedures(columns, rows, square_mm, radius_mm, height_mm, middle_mm, lens_mm),
         *(noise.procedures(thing) if thing is not None else ()),

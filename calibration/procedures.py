@@ -2,16 +2,12 @@
 
 from calibration.backlash import Backlash as Backlash
 from calibration.cable import Cable as Cable
-from calibration.camera_light import CameraCard as CameraCard
-from calibration.camera_light import CameraNoise as CameraNoise
 from calibration.camera_model import CameraModel as CameraModel
 from calibration.camera_time import CameraTime as CameraTime
 from calibration.encoder import Encoder as Encoder
-from calibration.gyro_noise import GyroNoise as GyroNoise
 from calibration.gyro_rotation import GyroRotation as GyroRotation
 from calibration.gyro_scale import GyroScale as GyroScale
 from calibration.imu_mounting import ImuMounting as ImuMounting
-from calibration.motion_model import MotionModel as MotionModel
 from calibration.procedure import Procedure
 from calibration.repeatability import Repeatability as Repeatability
 from calibration.table_axis import TableAxis as TableAxis
@@ -20,13 +16,9 @@ PROCEDURES: tuple[type[Procedure], ...] = (
     Cable,
     Backlash,
     Encoder,
-    MotionModel,
     GyroScale,
     ImuMounting,
-    GyroNoise,
     GyroRotation,
-    CameraNoise,
-    CameraCard,
     CameraModel,
     TableAxis,
     CameraTime,

@@ -17,7 +17,7 @@ from rig.config import RigConfig, Section
 from rig.core.clock import SystemClock
 from rig.core.errors import ObjectNotFound, UsageError
 from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
-from sim.calibration_board import calibration_targets
+from sim.calibration_board import boards
 from sim.camera import CAMERA_DEVICE
 from sim.change import Change
 from sim.clock import PacedClock, VirtualClock
@@ -71,7 +71,7 @@ class SimOptions(Section):
 class ShelfOperator:
     """The simulated operator: puts objects on the table, on the mark to enroll, in any orientation to identify.
 
-    Each object stands a little off the table's axis. Calibration boards and a grey card are available, too.
+    Each object stands a little off the table's axis. Calibration boards are available, too.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class ShelfOperator:
     optics
         The camera's optics for the boards, drawn from the world's seed.
     targets
-        Calibration boards and a grey card, by name.
+        Calibration boards, by name.
     backdrop
         See `sim.camera.SimCapture`.
     """
@@ -109,7 +109,7 @@ class ShelfOperator:
         self.faults: Faults | None = None
         self.state: StateStore = MemoryStore()
         self.optics = Optics.of(world)
-        self.targets: Mapping[str, SimObject] = calibration_targets(self.optics)
+        self.targets: Mapping[str, SimObject] = boards(self.optics)
         self._rng = world.rng("operator")
         self._days = world.rng("days")
 

@@ -1,4 +1,4 @@
-"""A ChArUco board on the platter, drawn through the lens of `sim.optics`, and a grey card."""
+"""A ChArUco board on the platter, drawn through the lens of `sim.optics`."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rig.views.charuco_board import CharucoBoard
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 from sim.optics import SUPERSAMPLING, Optics
-from sim.world import SimObject
 
 TEXTURE_PX_MM = 10  # five texels for a pixel of the frame; fewer: corners are rounded; more: a board takes more memory
 _FAR = 1e4  # texels: outside every texture
@@ -133,23 +132,6 @@ def _texture(board: CharucoBoard) -> NDArray[np.uint8]:
     grey = board.picture(TEXTURE_PX_MM)
     paper = np.clip(grey.astype(np.float32) * (215 - 25) / 255 + 25, 0, 255).astype(np.uint8)
     return np.dstack([paper, np.full_like(paper, 255)])
-
-
-@dataclass(frozen=True)
-class GreyCard:
-    """A plain card that fills the frame."""
-
-    level: int = 170
-    name: str = "grey-card"
-
-    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:  # noqa: ARG002
-        """Fill ``image``."""
-        image[:] = self.level
-
-
-def calibration_targets(optics: Optics) -> dict[str, SimObject]:
-    """Return the objects that camera calibrations need, by name: the grey card, and the board on each stand."""
-    return {GreyCard().name: GreyCard(), **boards(optics)}
 
 
 def boards(optics: Optics) -> dict[str, BoardOnPlatter]:

@@ -96,18 +96,6 @@ class RejectionCode(Enum):
         "The table's axis is {level_deg:.1f}° off the vertical, more than {limit_deg:g}°. Level the base. If it is "
         "level, check the accelerometer's range."
     )
-    GYRO_NOISY = (
-        "The angle random walk is {arw:.4f} °/√s, more than {limit:g} °/√s: the bench shakes, or the sensor is broken."
-        " Keep people and fans away from the bench, and calibrate again."
-    )
-    RATE_JUMPED = (
-        "After {at_s:.0f} s the rate jumped by {jump_dps:.3f} °/s: the table was touched or shaken. Keep hands off, "
-        "and calibrate again."
-    )
-    SAMPLES_LOST = (
-        "The sensor lost {lost} samples: another program used the bus, or the computer was busy. Close other programs,"
-        " and calibrate again."
-    )
     TOO_FEW_MOVES = (
         "Too few {speed} rotations can be used, {needed} in each direction are needed{reasons}. Calibrate again."
     )
@@ -121,42 +109,6 @@ class RejectionCode(Enum):
         "the stated noise of the sensor is too large. Check that the right sensor is configured, and calibrate again."
     )
     # -- camera --
-    CONTRAST_TOO_LOW = (
-        "The scene spans {span:.0f} grey levels, {needed:g} are needed. Put something black and white in front of the "
-        "camera, and lock an exposure that neither saturates nor darkens."
-    )
-    NOISE_INDEPENDENT_OF_LIGHT = (
-        "The noise does not grow with the light: the camera processes the frames. Switch noise reduction off."
-    )
-    NOT_SHARP = "The board's sharpness is {sharpness:.1f}, below {needed:g}. Focus the lens, and calibrate again."
-    CARD_EXPOSURE = (
-        "The card's level is {level:.0f}: too dark or saturated. Change camera.exposure_us, and calibrate again."
-    )
-    CARD_UNEVEN = (
-        "Parts of the frame deviate from the card's smooth shading by {residual:.0%}. Fill the frame with a plain "
-        "card, and keep shadows off it."
-    )
-    VIGNETTING_TOO_LARGE = (
-        "The corners lose {loss:.0%} of the light: something covers the lens, or the zoom is at its end. Clear the "
-        "lens or change the zoom, and calibrate again."
-    )
-    CARD_BLACK = (
-        "The card, or one of its colours, is black. Take the cap off the lens, light the card, or raise "
-        "camera.exposure_us."
-    )
-    LOCKS_CHANGED = "The camera changed its settings: {before} became {after}. Lock them in [camera]."
-    LIGHT_DRIFTED = (
-        "The light drifted by {drift_percent:.1f} % in {minutes:.0f} minutes, more than {limit_percent:g} %. Let the "
-        "lamps warm up, keep daylight out, and calibrate again."
-    )
-    LIGHT_FLICKERS = (
-        "The light flickers by {flicker:.1%}, more than {limit:.0%}. Choose an exposure of whole periods of the mains "
-        "(10 or 8.33 ms), or a lamp that does not flicker."
-    )
-    COLOUR_CAST = (
-        "The card looks coloured: red is {red:.2f} and blue {blue:.2f} of green. Change camera.white_balance_k until "
-        "both are near 1, or use a grey card."
-    )
     EXPOSURE_NOT_LOCKED = (
         "The exposure time is not locked, so the middle of an exposure changes. Set camera.exposure_us to a number."
     )

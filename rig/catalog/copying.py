@@ -1,29 +1,25 @@
-"""Copies of a catalog: a whole one at another place, and the local copy of one on a server.
+"""The local copy of a catalog on a server, which searches read while the server does not answer.
 
-A whole copy, between SQLite and PostgreSQL, has the id and the digest of every row. The local copy has the log without
-answers, the enrollments that searches use, and their descriptions: searches read it while the server does not answer.
+It has the log without answers, the enrollments that searches use, and their descriptions.
 
 Decision: docs/decisions/0011.
 """
 
 import json
 import shutil
-from collections.abc import Generator
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Table, delete, func, insert, select, text, update
+from sqlalchemy import ColumnElement, Table, delete, insert, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, sessions, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.columns import damaged
 from rig.catalog.database import properties
-from rig.catalog.facts import Action, Derived, Enrollment, Entry, Property, Row, Session, View
-from rig.catalog.jobs import JobProgress, portions
-from rig.catalog.upkeep import NAMED_IMAGES
+from rig.catalog.facts import Derived, Enrollment, Entry, Property, Row, Session, View
+from rig.catalog.jobs import portions
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable
@@ -42,96 +38,6 @@ def _copy_rows(reading: Transaction, writing: Transaction, table: type[Row], *wa
     assert isinstance(columns, Table)
     for part in reading.execute(select(columns).where(*wanted)).mappings().partitions(500):
         writing.execute(insert(columns), list(map(dict, part)))
-
-
-# A whole catalog
-
-
-class Copied(NamedTuple):
-    """What was copied."""
-
-    objects: int
-    views: int
-    results: int
-    images: int
-    image_bytes: int
-
-
-def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, None, Copied]:
-    """Copy everything from a catalog into an empty one. The target stays empty if the call does not end.
-
-    Every row keeps its id and its digest. An interrupted copy can be repeated.
-
-    Raises `CatalogError`, `CatalogBusy`: the target is not empty, or one of them cannot be used.
-    """
-    with source.database.read() as reading:
-        _check_all(reading)
-        with target.database.read() as transaction:
-            _check_empty(transaction, target)
-        size = 0
-        wanted = sorted(_images(reading))
-        for done, name in enumerate(wanted):
-            if done % 50 == 0:
-                yield JobProgress(done, len(wanted))
-            with source.database.catalog_errors():
-                content = source.database.images.content(name)
-            size += len(content)
-            with target.database.catalog_errors():
-                target.database.images.put(content, settled=False)
-        yield JobProgress(len(wanted), len(wanted))
-        with target.database.catalog_errors():
-            target.database.images.settle(wanted)
-        # Images first: a row of a catalog never names an image that is not there.
-        with target.database.write() as writing:
-            _check_empty(writing, target)
-            for table in (Entry, Enrollment, Session, View, Derived):
-                _copy_rows(reading, writing, table)
-            head = reading.scalar(select(Property.value).where(Property.key == "head"))
-            writing.execute(update(Property).where(Property.key == "head").values(value=head))
-            _set_last_ids(writing)
-            _check_all(writing)
-            results = writing.scalar(select(func.count()).where(Entry.action == Action.IDENTIFIED)) or 0
-        objects = len(target.objects())
-        views = reading.scalar(select(func.count()).select_from(View)) or 0
-    copied = Copied(objects, views, results, len(wanted), size)
-    target.note(Action.COPIED, origin=str(source.place), **copied._asdict())
-    return copied
-
-
-def _check_all(transaction: Transaction) -> None:
-    """Raise `CatalogDamaged` if a line of the log or a row of an enrollment is not as it was written."""
-    state.check(transaction)
-    wrong = next(log.wrong_lines(transaction), None)
-    if wrong is not None:
-        raise damaged("its log", f"wrong at line {wrong}")
-
-
-def _check_empty(transaction: Transaction, target: Catalog) -> None:
-    if log.head(transaction)[0] or transaction.scalar(select(Enrollment.id).limit(1)) is not None:
-        raise CatalogError(
-            f"The catalog {target.place} is not empty.",
-            next_step=("Give a new place, or", Do.MERGE()),
-        )
-
-
-def _images(transaction: Transaction) -> set[str]:
-    """Return the names of all images that rows or answers name."""
-    return {image for image in transaction.scalars(select(NAMED_IMAGES.c.image)) if image is not None}
-
-
-def _set_last_ids(transaction: Transaction) -> None:
-    """Let the next enrollment and the next view have new ids: an id that was given once must not be given again."""
-    enrollment = transaction.scalar(select(func.max(Entry.enrollment_id))) or 0
-    for table, last in (("enrollments", enrollment), ("views", transaction.scalar(select(func.max(View.id))) or 0)):
-        values = {"name": table, "last": last}
-        if last and transaction.get_bind().dialect.name == "postgresql":
-            transaction.execute(text(f"SELECT setval('{table}_id_seq', :last)"), values)
-        elif last:
-            transaction.execute(text("DELETE FROM sqlite_sequence WHERE name = :name"), values)
-            transaction.execute(text("INSERT INTO sqlite_sequence (name, seq) VALUES (:name, :last)"), values)
-
-
-# The local copy
 
 
 class Attempts:

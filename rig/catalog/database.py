@@ -66,10 +66,6 @@ class Database(ABC):
         """Return what the database's own check of its structure finds."""
         return []
 
-    @abstractmethod
-    def size_bytes(self, transaction: Transaction) -> int:
-        """Return the size of the database."""
-
 
 def _transaction(connection: Connection) -> Transaction:
     return Transaction(connection, expire_on_commit=False, autoflush=True)

@@ -9,12 +9,10 @@ Decision: docs/decisions/0010.
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from sqlalchemy import select
-from sqlalchemy.orm import Session as Transaction
 
 import hbr
 from hbr.dense.local_difference import LocalView
@@ -22,7 +20,7 @@ from hbr.dense.session import near
 from hbr.descriptors import descriptor
 from hbr.kernels.library import THREADS
 from rig.calibrations.store import CALIBRATIONS
-from rig.catalog import log, state
+from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
 from rig.catalog.describing import (
@@ -40,13 +38,13 @@ from rig.catalog.describing import (
     stored_contents,
     task_of,
 )
-from rig.catalog.facts import Action, Enrollment, Entry, Session, View, seal_of
+from rig.catalog.facts import Enrollment, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, finished, processes
-from rig.catalog.records import EnrollmentStatus, Region
+from rig.catalog.records import Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogDamaged, CatalogError, RigError
 from rig.core.next_steps import Do
-from rig.core.processes import Jobs, map_in_processes
+from rig.core.processes import map_in_processes
 from rig.views.description import (
     BENCH_DESCRIPTOR,
     DESCRIPTORS,
@@ -63,11 +61,8 @@ def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str)
     kinds = wanted or DESCRIPTORS
     seal = seal_of(enrollment)
     with catalog.database.read() as transaction:
-        region = _regions(transaction).of(transaction, enrollment.id)
         needed = kinds if all(descriptor(kind).whole_image for kind in kinds) else (SEGMENTATION, *kinds)
-        stored = {
-            kind: found.get(seal, b"") for kind, found in stored_contents(transaction, [seal], needed, region).items()
-        }
+        stored = {kind: found.get(seal, b"") for kind, found in stored_contents(transaction, [seal], needed).items()}
     if all(stored.values()):
         packed = {kind: records_of(descriptor(kind), stored[kind])["packed"].tobytes() for kind in kinds}
         levels = {kind: descriptor(kind).unpack_rows(content) for kind, content in packed.items()}
@@ -76,7 +71,7 @@ def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str)
         with suppress(ValueError, TypeError, AttributeError, RigError):
             evidence = evidence_of(stored[SEGMENTATION], count) if SEGMENTATION in needed else ({},) * count
             return Described(levels, evidence)
-    task = task_of(enrollment, seal, name, kinds, region)
+    task = task_of(enrollment, seal, name, kinds)
     with catalog.database.catalog_errors():
         found = describe(held_pixels(catalog.database.images), task, threads=THREADS)
     store(catalog.database, [(task, found)])
@@ -94,7 +89,7 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
     kind = known_descriptor(descriptor)
     found: dict[str, bytes] = {}
     wanted, tasks = _missing(catalog, kind.name, found)
-    for task, result in (yield from _described_now(catalog, tasks, None)):
+    for task, result in (yield from _described_now(catalog, tasks)):
         if isinstance(result, str):
             raise CatalogError(f"{task.name!r} cannot be described: {result}.", next_step=Do.VERIFY_CATALOG())
         found[task.seal] = contents_of(task, result)[kind.name]
@@ -126,45 +121,6 @@ def views(
     return finished(load_views(catalog, descriptor), show)
 
 
-@dataclass(frozen=True, slots=True)
-class Redescribed:
-    """Numbers of views that were described now and before, and the objects that failed, with the reasons."""
-
-    descriptor: str
-    version: int
-    described: int
-    unchanged: int
-    failed: tuple[tuple[str, str], ...]
-
-
-def redescribe(
-    catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, *, jobs: Jobs | None = None
-) -> Generator[JobProgress, None, Redescribed]:
-    """Describe the objects in use that are not described by the present version of a descriptor.
-
-    Each result is stored at once: after an interruption the next call continues there.
-
-    Raises `UsageError`: there is no such descriptor.
-    """
-    kind = known_descriptor(descriptor)
-    found: dict[str, bytes] = {}
-    _, tasks = _missing(catalog, kind.name, found)
-    results = yield from _described_now(catalog, tasks, jobs, required=True)
-    failed = [(task.name, result) for task, result in results if isinstance(result, str)]
-    described = sum(len(task.views) for task, result in results if not isinstance(result, str))
-    unchanged = sum(len(records_of(kind, content)) for content in found.values())
-    return Redescribed(kind.name, kind.version, described, unchanged, tuple(failed))
-
-
-def choose_region(catalog: Catalog, region: Region | None) -> None:
-    """Let the views of benches in use be described within another part of their images; None for the whole image.
-
-    Imported photographs keep theirs.
-    """
-    with catalog.database.write() as transaction:
-        log.append(transaction, catalog.clock, Action.REGION_CHOSEN, details={"region": region})
-
-
 def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
     """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
 
@@ -178,12 +134,11 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     if enrollment is None:
         return []
     evidence = described(catalog, enrollment, name, BENCH_DESCRIPTOR).segmentation
-    regions = regions_of(catalog, enrollment)
     describers: dict[tuple[Region | None, str | None], ViewDescriber] = {}
     cut_out = []
     for place in near([view.azimuth_deg for view in enrollment.views], azimuths_deg):
-        view, region = enrollment.views[place], regions[place]
-        table = enrollment.sessions[view.session].empty_table
+        view = enrollment.views[place]
+        region, table = view.region, enrollment.sessions[view.session].empty_table
         if (region, table) not in describers:  # it prepares the empty-table image
             empty = None if table is None else catalog.read_image(table)
             describers[region, table] = ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), empty)
@@ -197,13 +152,6 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     return cut_out
 
 
-def regions_of(catalog: Catalog, enrollment: Enrollment) -> tuple[Region | None, ...]:
-    """Return the part of the image of each view that is described; None for the whole image."""
-    with catalog.database.read() as transaction:
-        chosen = _regions(transaction).of(transaction, enrollment.id)
-    return tuple(view.region if chosen is None else chosen[0] for view in enrollment.views)
-
-
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
     """Return the regions that the views of a bench are described within; None is the whole image.
 
@@ -211,7 +159,6 @@ def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, 
     """
     sessions, found = Session.__table__.c, set()
     with catalog.database.read() as transaction:
-        regions = _regions(transaction)
         ids = {one.enrollment_id for one in state.used(transaction)}
         rows = transaction.execute(
             select(sessions.enrollment_id, sessions.conditions, View.region)
@@ -220,36 +167,8 @@ def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, 
         ).all()
         for enrollment_id, conditions, region in rows:
             if enrollment_id in ids:
-                chosen = regions.of(transaction, enrollment_id)
-                calibrations = tuple(map(str, conditions.get(CALIBRATIONS) or ()))
-                found.add((region if chosen is None else chosen[0], calibrations))
+                found.add((region, tuple(map(str, conditions.get(CALIBRATIONS) or ()))))
     return found
-
-
-@dataclass(frozen=True, slots=True)
-class _Regions:
-    """The lines of the log that choose a region for what was enrolled before them, the last one first."""
-
-    lines: tuple[tuple[int, Region | None], ...]
-
-    def of(self, transaction: Transaction, enrollment_id: int) -> tuple[Region | None] | None:
-        """Return the chosen region of an enrollment; None if its views keep their own."""
-        if not self.lines:
-            return None
-        line = transaction.scalar(
-            select(Entry.id).where(Entry.enrollment_id == enrollment_id, Entry.status == EnrollmentStatus.COMPLETE)
-        )
-        bench = transaction.scalar(select(Session.__table__.c.bench).where(Session.enrollment_id == enrollment_id))
-        if line is None or not bench:
-            return None
-        return next(((region,) for number, region in self.lines if number > line), None)
-
-
-def _regions(transaction: Transaction) -> _Regions:
-    rows = transaction.execute(
-        select(Entry.id, Entry.details).where(Entry.action == Action.REGION_CHOSEN).order_by(Entry.id.desc())
-    )
-    return _Regions(tuple((line, tuple(d["region"]) if d.get("region") else None) for line, d in rows))
 
 
 # Describe
@@ -261,22 +180,17 @@ def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list
     compute = DESCRIPTORS if name in DESCRIPTORS and not descriptor(name).whole_image else (name,)
     with catalog.database.read() as transaction:
         wanted = state.used(transaction, checked=True)
-        regions = _regions(transaction)
-        chosen = {one.seal: regions.of(transaction, one.enrollment_id) for one in wanted}
-        for region in set(chosen.values()):
-            seals = [seal for seal, one in chosen.items() if one == region]
-            stored = stored_contents(transaction, seals, (name,), region)
-            found.update(stored[name])
+        found.update(stored_contents(transaction, [one.seal for one in wanted], (name,))[name])
         missing = [one for one in wanted if one.seal not in found]
         tasks = []
         for one in missing:
             (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
-            tasks.append(task_of(known.enrollment, one.seal, one.name, compute, chosen[one.seal]))
+            tasks.append(task_of(known.enrollment, one.seal, one.name, compute))
     return wanted, tasks
 
 
 def _described_now(
-    catalog: Catalog, tasks: Sequence[Task], jobs: Jobs | None, *, required: bool = False
+    catalog: Catalog, tasks: Sequence[Task]
 ) -> Generator[JobProgress, None, list[tuple[Task, Described | str]]]:
     """Describe enrollments in processes and store the results; a text is the reason why one cannot be described."""
     done: list[tuple[Task, Described | str]] = []
@@ -284,9 +198,9 @@ def _described_now(
         yield JobProgress(0, len(tasks))
     work = partial(describe_task, catalog.database.images)
     count = sum(len(task.views) for task in tasks)
-    for task, result in map_in_processes(work, tasks, processes(jobs, count)):
+    for task, result in map_in_processes(work, tasks, processes(None, count)):
         if not isinstance(result, str):
-            store(catalog.database, [(task, result)], required=required)
+            store(catalog.database, [(task, result)])
         done.append((task, result))
         yield JobProgress(len(done), len(tasks))
     return done

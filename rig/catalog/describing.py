@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -60,7 +60,6 @@ class Task(NamedTuple):
     seal: str
     name: str
     names: tuple[str, ...]
-    region: tuple[Region | None] | None
     views: tuple[_DescribedImage, ...]
     empty_tables: tuple[str | None, ...]
 
@@ -104,7 +103,7 @@ def describe_new(database: Database, enrollment: Enrollment, held: Mapping[str, 
     """
     images = database.images
     seal = seal_of(enrollment)
-    task = task_of(enrollment, seal, name, DESCRIPTORS, None)
+    task = task_of(enrollment, seal, name, DESCRIPTORS)
 
     with database.catalog_errors():
         found = describe(held_pixels(images, held), task, threads=THREADS)
@@ -112,15 +111,10 @@ def describe_new(database: Database, enrollment: Enrollment, held: Mapping[str, 
     return seal
 
 
-def task_of(
-    enrollment: Enrollment, seal: str, name: str, names: tuple[str, ...], region: tuple[Region | None] | None
-) -> Task:
-    """Return the task to describe an enrollment; ``region`` is the one that was chosen later."""
-    views = tuple(
-        _DescribedImage(view.image, view.session, view.region if region is None else region[0], view.azimuth_deg)
-        for view in enrollment.views
-    )
-    return Task(seal, name, names, region, views, tuple(session.empty_table for session in enrollment.sessions))
+def task_of(enrollment: Enrollment, seal: str, name: str, names: tuple[str, ...]) -> Task:
+    """Return the task to describe an enrollment."""
+    views = tuple(_DescribedImage(view.image, view.session, view.region, view.azimuth_deg) for view in enrollment.views)
+    return Task(seal, name, names, views, tuple(session.empty_table for session in enrollment.sessions))
 
 
 def held_pixels(images: Images, held: Mapping[str, NDArray[np.uint8]] | None = None) -> _Pixels:
@@ -234,12 +228,12 @@ class _reasons:  # noqa: N801 - used as a function
 # Store
 
 
-def made_by_of(what: str, region: tuple[Region | None] | None) -> str:
+def made_by_of(what: str) -> str:
     version = SEGMENTATION_VERSION if what == SEGMENTATION else descriptor(what).version
     segmentation = (
         "" if what != SEGMENTATION and descriptor(what).whole_image else f", segmentation {SEGMENTATION_VERSION}"
     )
-    return f"{what} {version}{segmentation}{'' if region is None else f', region {region[0]}'}"
+    return f"{what} {version}{segmentation}"
 
 
 def record_of(kind: Descriptor) -> np.dtype[np.void]:
@@ -257,9 +251,9 @@ def content_of(kind: Descriptor, packed: NDArray[np.uint8], azimuth_deg: ArrayLi
     return records.tobytes()
 
 
-def row_of(seal: str, what: str, region: tuple[Region | None] | None, content: bytes) -> dict[str, Any]:
-    """Return the columns of a row of `Derived` by this program; ``region`` is the one that was chosen later."""
-    made_by = made_by_of(what, region)
+def row_of(seal: str, what: str, content: bytes) -> dict[str, Any]:
+    """Return the columns of a row of `Derived` by this program."""
+    made_by = made_by_of(what)
     sha256 = digest_of(seal, what, made_by, content)
     return {"seal": seal, "what": what, "made_by": made_by, "content": content, "sha256": sha256}
 
@@ -283,14 +277,12 @@ def contents_of(task: Task, found: Described) -> dict[str, bytes]:
     return contents
 
 
-def store(database: Database, done: Sequence[tuple[Task, Described]], *, required: bool = False) -> None:
-    """Store descriptions. Unless it is ``required``, they are only computed again if this fails."""
+def store(database: Database, done: Sequence[tuple[Task, Described]]) -> None:
+    """Store descriptions; they are computed again if this fails."""
     rows = [
-        row_of(task.seal, what, task.region, content)
-        for task, found in done
-        for what, content in contents_of(task, found).items()
+        row_of(task.seal, what, content) for task, found in done for what, content in contents_of(task, found).items()
     ]
-    with nullcontext() if required else suppress(RigError):
+    with suppress(RigError):
         if not database.read_only:
             _write(database, rows)
             return
@@ -316,13 +308,13 @@ def add(transaction: Transaction, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def stored_contents(
-    transaction: Transaction, seals: Collection[str], kinds: Iterable[str], region: tuple[Region | None] | None
+    transaction: Transaction, seals: Collection[str], kinds: Iterable[str]
 ) -> dict[str, dict[str, bytes]]:
     """Return the stored contents of each kind by seal; those that are damaged or old are left out."""
     wanted = set(seals)
     found: dict[str, dict[str, bytes]] = {}
     for what in kinds:
-        made_by = made_by_of(what, region)
+        made_by = made_by_of(what)
         query = select(Derived.seal, Derived.content, Derived.sha256).where(
             Derived.what == what, Derived.made_by == made_by
         )

@@ -68,8 +68,6 @@ class Action(StrEnum):
     UNDELETED = "undeleted"
     IMPORTED = "imported"
     GARBAGE_COLLECTED = "collected garbage"
-    REGION_CHOSEN = "region chosen"
-    COPIED = "copied"
     DELIVERED = "delivered"
     MOVED = "moved"
     TABLE_PHOTOGRAPHED = "photographed the empty table"

@@ -117,10 +117,6 @@ class Images(ABC):
         """Remove images. A missing one is no error."""
 
     @abstractmethod
-    def free_bytes(self) -> int | None:
-        """Return the free space; None if the store reports no limit."""
-
-    @abstractmethod
     def mark(self) -> str | None:
         """Return the id of the catalog that the images belong to."""
 
@@ -208,10 +204,6 @@ class FolderImages(Images):
             with suppress(OSError):  # its folder is not empty
                 path.parent.rmdir()
 
-    def free_bytes(self) -> int | None:
-        disk = os.statvfs(self.root)
-        return disk.f_bavail * disk.f_frsize
-
     def mark(self) -> str | None:
         with suppress(FileNotFoundError):
             return read_local(self.root / MARK, max_bytes=100).decode()
@@ -289,9 +281,6 @@ class FsspecImages(Images):
                 with suppress(FileNotFoundError):
                     store.rm_file(f"{root}/{path_of(name)}")
                 (self._cache / path_of(name)).unlink(missing_ok=True)
-
-    def free_bytes(self) -> int | None:
-        return None
 
     def mark(self) -> str | None:
         with suppress(FileNotFoundError), self._store() as (store, root):

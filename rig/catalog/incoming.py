@@ -19,7 +19,7 @@ from rig.catalog import describing
 from rig.catalog.images import Images, name_of
 from rig.catalog.jobs import JobProgress, processes
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
-from rig.core.processes import Jobs, map_in_processes
+from rig.core.processes import map_in_processes
 from rig.views.image_files import BadImage, decode
 
 
@@ -123,7 +123,7 @@ class _Rejected(Exception):
 
 
 def read_images(
-    reading: Reading, tasks: Sequence[describing.Task], *, strict: bool, jobs: Jobs | None
+    reading: Reading, tasks: Sequence[describing.Task], *, strict: bool, jobs: int | None
 ) -> Generator[JobProgress, None, ReadImages]:
     """Read the images of enrollments; with ``strict`` it ends at the first enrollment with a rejected one."""
     total, done = sum(len(_names(task)) for task in tasks), 0

@@ -6,9 +6,6 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Final, TypeVar
 
-from rig.core.cluster import Cluster
-from rig.core.processes import Jobs
-
 _T = TypeVar("_T")
 
 PORTION: Final = 32
@@ -41,8 +38,6 @@ def portions(items: Iterable[_T], size: int = PORTION) -> Iterator[tuple[_T, ...
         yield portion
 
 
-def processes(wanted: Jobs | None, items: int) -> Jobs:
-    """Return the useful number of processes for a number of images; a cluster is returned unchanged."""
-    if isinstance(wanted, Cluster):
-        return wanted
+def processes(wanted: int | None, items: int) -> int:
+    """Return the useful number of processes for a number of images."""
     return min(wanted or os.cpu_count() or 1, max(1, items // (4 * PORTION)))

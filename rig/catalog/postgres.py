@@ -10,10 +10,9 @@ from typing import Any, Final
 from sqlalchemy import DDL, Connection, QueuePool, create_engine, event, func, select, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
-from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.database import Database, check_properties, create_tables, properties
-from rig.catalog.facts import FACTS, Enrollment, Entry, Property, Row, json_text
+from rig.catalog.facts import FACTS, Enrollment, Entry, Property, json_text
 from rig.catalog.failures import server_errors
 from rig.catalog.images import open_images
 from rig.config.catalog_place import CatalogPlace
@@ -145,10 +144,6 @@ class PostgresDatabase(Database):
             if _has_tables(connection):
                 return  # another process was faster
             create_tables(connection)
-
-    def size_bytes(self, transaction: Transaction) -> int:
-        sizes = (transaction.scalar(select(func.pg_total_relation_size(name))) or 0 for name in Row.metadata.tables)
-        return sum(sizes)
 
 
 def _absent(place: CatalogPlace) -> CatalogError:

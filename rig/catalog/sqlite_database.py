@@ -115,9 +115,6 @@ class SqliteDatabase(Database):
         ]
         return found
 
-    def size_bytes(self, transaction: Transaction) -> int:  # noqa: ARG002
-        return sum(file.stat().st_size for file in self.root.glob(f"{DATABASE_NAME}*"))
-
     def _connect(self) -> sqlite3.Connection:
         mode = "rw"
         if self.read_only:

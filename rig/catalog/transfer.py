@@ -37,7 +37,6 @@ from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, cle
 from rig.catalog.state import Ended, EnrollmentState, Named
 from rig.core.errors import CatalogDamaged, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
-from rig.core.processes import Jobs
 
 _OF_SESSION: Final = ("number", "started_utc", "provenance", "empty_table", "empty_table_bytes")
 _OF_VIEW: Final = tuple(name for name, _ in digested(View) if name != "session")
@@ -171,7 +170,7 @@ def transfer(
     conflict: Conflict = Conflict.REJECT,
     label: str | None = None,
     descriptors: Sequence[str] = (),
-    jobs: Jobs | None = None,
+    jobs: int | None = None,
     dry_run: bool = False,
     once: bool = False,
 ) -> Generator[JobProgress, None, Transferred]:
@@ -187,7 +186,7 @@ def transfer(
     descriptors
         Descriptors to be computed at once; others are computed when they are needed.
     jobs
-        Number of processes, or a cluster; None for one process per core.
+        Number of processes; None for one process per core.
     dry_run
         Only check everything.
     once
@@ -212,7 +211,7 @@ def transfer(
         plan = plan.compared(transaction, conflict, once=once)
     names = tuple(dict.fromkeys(descriptors))
     tasks = [
-        describing.task_of(one.enrollment, one.enrollment.key, item.name, names, None)
+        describing.task_of(one.enrollment, one.enrollment.key, item.name, names)
         for item in plan.wanted
         for one in item.enrollments
     ]
@@ -490,7 +489,7 @@ def _computed(
 ) -> list[dict[str, Any]]:
     """Return the rows of what was computed from new enrollments, here or by their catalog."""
     rows = [
-        describing.row_of(seal_of(enrollment), what, None, content)
+        describing.row_of(seal_of(enrollment), what, content)
         for key, enrollment in new.items()
         for what, content in contents.get(key, {}).items()
     ]

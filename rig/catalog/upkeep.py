@@ -1,4 +1,4 @@
-"""Statistics of a catalog, and the final removal of deleted data.
+"""The final removal of deleted data from a catalog.
 
 Decision: docs/decisions/0009.
 """
@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.facts import SCHEMA_VERSION, Action, Derived, Enrollment, Entry, Session, View
+from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View
 from rig.catalog.jobs import portions
 from rig.catalog.records import EnrollmentStatus
 from rig.catalog.state import Ended, Named
@@ -29,23 +29,6 @@ _OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
 
 
 @dataclass(frozen=True, slots=True)
-class Statistics:
-    """Numbers and sizes in bytes; `free_disk_bytes` is None for an object store."""
-
-    schema_version: int
-    objects: int
-    deleted_objects: int
-    enrollments: dict[str, int]
-    views: int
-    image_bytes: int
-    database_bytes: int
-    free_disk_bytes: int | None
-    log_entries: int
-    results: int
-    result_image_bytes: int
-
-
-@dataclass(frozen=True, slots=True)
 class GarbageReport:
     """What `collect_garbage` removed."""
 
@@ -54,30 +37,6 @@ class GarbageReport:
     views: int
     files: int
     bytes: int
-
-
-def statistics(catalog: Catalog) -> Statistics:
-    """Return the statistics of a catalog."""
-    count = (Ended.status, func.count(Enrollment.id.distinct()), func.count(View.id), func.sum(View.image_bytes))
-    deleted = _states(func.count(Enrollment.object_id.distinct())).where(Named.deleted == true())
-    answers = select(func.count(), func.sum(Entry.record["image_bytes"].as_integer()))
-    with catalog.database.read() as transaction:
-        views = _states(*count).outerjoin(View, View.enrollment_id == Enrollment.id).group_by(Ended.status)
-        found = transaction.execute(views).all()
-        results, result_bytes = transaction.execute(answers.where(Entry.action == Action.IDENTIFIED)).one()
-        return Statistics(
-            schema_version=SCHEMA_VERSION,
-            objects=transaction.scalar(select(func.count()).where(state.IN_USE)) or 0,
-            deleted_objects=transaction.scalar(deleted) or 0,
-            enrollments={str(status): number for status, number, _, _ in found},
-            views=sum(number for _, _, number, _ in found),
-            image_bytes=sum(size or 0 for *_, size in found),
-            database_bytes=catalog.database.size_bytes(transaction),
-            free_disk_bytes=catalog.database.images.free_bytes(),
-            log_entries=log.head(transaction)[0],
-            results=results,
-            result_image_bytes=result_bytes or 0,
-        )
 
 
 def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = False) -> GarbageReport:

@@ -20,7 +20,7 @@ from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.state import Ended, Named
 from rig.catalog.upkeep import NAMED_IMAGES
 from rig.core.errors import CatalogDamaged
-from rig.core.processes import Jobs, map_in_processes
+from rig.core.processes import map_in_processes
 from rig.views import image_files as files
 
 _LINES, _ENROLLMENTS = 100, 10
@@ -98,7 +98,7 @@ class _RequiredImage(NamedTuple):
     stored_bytes: int
 
 
-def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgress, None, CatalogVerification]:
+def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgress, None, CatalogVerification]:
     """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core."""
     findings, of_images = list[CatalogFinding](), list[CatalogFinding]()
     with catalog.database.read() as transaction:

@@ -69,7 +69,6 @@ class DynamixelModel:
     dps_per_unit: float = 0.0
     dps2_per_unit: float = 0.0
     ma_per_unit: float = 0.0
-    pwm_percent_per_unit: float = 0.0
     load_percent_per_unit: float = 0.1
     v_per_unit: float = 0.1
     c_per_unit: float = 1.0
@@ -102,9 +101,8 @@ _X: Final[dict[str, Any]] = {
     "dps2_per_unit": 214.577 * 6.0 / 60.0,  # 214.577 rev/min²
     "extended_counts": 1_048_575,
     "most_units": 32_767,
-    "pwm_percent_per_unit": 0.113,
 }
-# e-manual, Profile Acceleration, Goal Position, Current Limit and PWM Limit of each series; by beginnings of the names.
+# e-manual, Profile Acceleration, Goal Position and Current Limit of each series; by beginnings of the names.
 _SERIES: Final[dict[tuple[str, ...], dict[str, Any]]] = {
     ("xl330", "xc330"): _X | {"ma_per_unit": 1.0},
     ("mx_",): _X | {"ma_per_unit": 3.36},
@@ -113,7 +111,6 @@ _SERIES: Final[dict[tuple[str, ...], dict[str, Any]]] = {
         "dps2_per_unit": 6.0 / 60.0,  # 1 rev/min²
         "extended_counts": 2**31 - 1,
         "ma_per_unit": 1.0,
-        "pwm_percent_per_unit": 0.0498,
     },
 }
 

@@ -101,10 +101,6 @@ class JobNotFound(RigError, code=204, title="job not found"):
     """The server has no job, run or picture with that name."""
 
 
-class ClusterFailed(RigError, code=205, title="cluster"):
-    """A cluster does not answer, or cannot do a job."""
-
-
 class ConfigError(RigError, code=300, title="configuration"):
     """The configuration has mistakes; the evidence lists all of them."""
 

@@ -94,8 +94,6 @@ class Do(StrEnum):
     UNDELETE = "undelete", "restore the object", "rig catalog undelete {name}"
     REMOVE_DELETED = "remove-deleted", "remove deleted objects from the disk", "rig catalog gc"
     VERIFY_CATALOG = "verify-catalog", "check the catalog", "rig catalog verify"
-    REDESCRIBE = "redescribe", "describe the stored images again", "rig catalog redescribe"
-    MERGE = "merge", "add the objects to a catalog", "rig import {source}"
     DELIVER_RENAMED = (
         "deliver-renamed",
         "deliver the object with another name",

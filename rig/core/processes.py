@@ -10,7 +10,6 @@ from itertools import chain, islice
 from multiprocessing import get_context
 from typing import Any, Final, TypeVar
 
-from rig.core.cluster import Cluster, map_on_cluster
 from rig.core.errors import RigError
 from rig.core.next_steps import Do
 
@@ -18,14 +17,11 @@ _Item = TypeVar("_Item")
 _T = TypeVar("_T")
 _work: Callable[[Any], object]
 
-Jobs = int | Cluster
-"""Number of processes on this computer, or a cluster."""
-
 _AHEAD: Final = 4
 """Items that are queued for each process, so that none waits for work."""
 
 
-def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: Jobs) -> Iterator[tuple[_Item, _T]]:
+def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: int) -> Iterator[tuple[_Item, _T]]:
     """Yield each item with its result, in the order of completion; closing the generator ends the processes.
 
     Parameters
@@ -35,11 +31,8 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
     items
         Items that can be hashed and pickled. They are read as they are needed.
     jobs
-        Largest number of processes; with 1 the work is done in this process. Or a cluster.
+        Largest number of processes; with 1 the work is done in this process.
     """
-    if isinstance(jobs, Cluster):
-        yield from map_on_cluster(work, items, jobs)
-        return
     waiting = iter(items)
     first = tuple(islice(waiting, jobs))
     jobs, waiting = min(jobs, len(first)), chain(first, waiting)

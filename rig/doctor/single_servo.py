@@ -13,8 +13,10 @@ from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import ControlTable, control_table, require_driven
 from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
-from rig.doctor.register_meaning import baud_codes
 
+BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
+"""Values of Baud Rate, Protocol 2.0 (e-manual)."""
+AX_BAUD = 2_000_000  # Protocol 1.0: the value of Baud Rate is this number divided by the rate, minus one
 MAX_ID = 252  # 253 is reserved, and 254 is the broadcast
 _SETTLE_S = 0.05  # time that a servo needs before it answers at a new rate
 
@@ -115,6 +117,17 @@ class SingleServo:
                 next_step=("Switch its supply off and on.", Do.FIND()),
                 evidence={"register": name, "wrote": value, "id": bus_id},
             )
+
+
+def baud_codes(table: ControlTable) -> dict[int, int]:
+    """Return the baud rates that a model can be set to, each with its register value."""
+    if table.row.protocol == 1:
+        return {
+            rate: round(AX_BAUD / rate) - 1
+            for rate in (9_600, 19_200, 57_600, 115_200, 200_000, 250_000, 500_000, 1_000_000)
+        }
+    fastest = 4_000_000 if table.row.name.startswith(("xl330", "xc330")) else 4_500_000
+    return {rate: code for rate, code in BAUD_CODES.items() if rate <= fastest}
 
 
 @contextmanager

@@ -17,7 +17,6 @@ from hbr.evaluation.perturb import Perturbations
 from hbr.evaluation.photographs import Dataset, Photograph, PhotographedObject
 from hbr.evaluation.protocol import Protocol, choose_methods
 from rig.catalog import Catalog
-from rig.catalog.derived import regions_of
 from rig.core import files as own_files
 
 DEFAULT: Final = "paper"
@@ -130,8 +129,7 @@ def load_catalog(catalog: Catalog) -> Dataset:
         enrollment = catalog.object(summary.name).complete
         if enrollment is not None and enrollment.views:
             photographs = [
-                Photograph(catalog.image_path(view.image), view.azimuth_deg, region)
-                for view, region in zip(enrollment.views, regions_of(catalog, enrollment), strict=True)
+                Photograph(catalog.image_path(view.image), view.azimuth_deg, view.region) for view in enrollment.views
             ]
             ordered = tuple(sorted(photographs, key=attrgetter("azimuth_deg")))
             objects.append(PhotographedObject(summary.name, ordered))

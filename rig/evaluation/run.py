@@ -21,7 +21,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do
-from rig.core.processes import Jobs, map_in_processes
+from rig.core.processes import map_in_processes
 from rig.evaluation.tables import rows_of
 
 FOLDER: Final = Path("rig-eval")
@@ -37,7 +37,7 @@ _T = TypeVar("_T")
 
 
 def run_experiment(
-    experiment: Experiment, dataset: Dataset, jobs: Jobs, advance: Callable[[str, str], None]
+    experiment: Experiment, dataset: Dataset, jobs: int, advance: Callable[[str, str], None]
 ) -> dict[str, Any]:
     """Return the results as JSON values; they do not depend on `jobs`.
 

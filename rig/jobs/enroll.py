@@ -1,18 +1,16 @@
 """The jobs that enroll: one object, or a tray."""
 
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Generator, Sequence
+from contextlib import closing
 
 from rig.catalog import Catalog
 from rig.catalog.journal import comparable_views, journal_words
-from rig.core.clock import Clock
 from rig.events.events import Enrolled, Event, Started
 from rig.jobs.desk import Desk, Remark, Steps
 from rig.jobs.regions import warn_of_other_regions
 from rig.jobs.table_image import refresh_table_image
 from rig.plans.enroll import enroll as enroll_views
 from rig.plans.enroll import similar_objects
-from rig.plans.estimate import DryRun, dry_run
 from rig.plans.tray import TrayItem, enroll_tray, left_to_enroll
 
 
@@ -56,29 +54,6 @@ def enroll_list(
             yield from refresh_table_image(desk, bench, bench.placer, ask=ask)
         events = enroll_tray(bench, catalog, items, views=views, operator=desk.who_places(bench), fly=fly)
         yield from _delivered(desk, catalog, events)
-
-
-def plan(
-    desk: Desk,
-    names: Mapping[str, int | None],
-    *,
-    views: int | None = None,
-    resume: bool = False,
-    replace: bool = False,
-    fly: bool | None = None,
-) -> tuple[DryRun, ...]:
-    """Return what an enrollment would do (`rig.plans.estimate.dry_run`). Nothing moves and nothing is stored."""
-    with desk.open_bench() as bench, _open_to_plan(desk, bench.clock) as catalog:
-        return dry_run(bench, catalog, names, views=views, resume=resume, replace=replace, fly=fly)
-
-
-def _open_to_plan(desk: Desk, clock: Clock) -> AbstractContextManager[Catalog | None]:
-    """Open the catalog that an enrollment would use, and create none."""
-    if desk.place.url is not None:
-        return desk.open_to_enroll(clock)
-    if not desk.place.may_exist():
-        return nullcontext()
-    return Catalog.open(desk.place, clock=clock, create=False, read_only=True)
 
 
 def _delivered(desk: Desk, catalog: Catalog, events: Generator[Event, None, object]) -> Steps[None]:

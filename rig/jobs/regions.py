@@ -31,15 +31,15 @@ def warn_of_other_regions(bench: Bench, catalog: Catalog) -> Iterator[Remark]:
         if other != region and not (calibrated_now and is_calibrated(other, calibrations))
     }
     if others:
-        enrolled = " and ".join(sorted("the whole image" if other is None else str(list(other)) for other in others))
-        argument = "whole" if region is None else ",".join(map(str, region))
+        words = sorted("the whole image" if other is None else str(list(other)) for other in others)
+        back = "REGION" if len(others) > 1 else "none" if None in others else words[0]
         yield Remark(
-            f"objects of this bench were enrolled with view.roi = {enrolled}; now it is "
+            f"objects of this bench were enrolled with view.roi = {' and '.join(words)}; now it is "
             f"{'the whole image' if region is None else list(region)}"
             f"{' (axis calibration)' if calibrated_now else ''}.",
             steps=(
                 "If the camera was not moved,",
-                Do.REDESCRIBE(region=argument),
+                Do.SET_KEY(key="view.roi", value=back),
                 "If it was moved,",
                 Do.ENROLL_AGAIN(),
             ),

@@ -1,22 +1,17 @@
-"""The plan of an enrollment before anything moves: table angles, duration, and whether it is possible."""
+"""The table angles of an enrollment, and the time that is left of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from itertools import pairwise
 from math import ceil, floor
 from typing import Final
 
 from hbr.core.angles import wrap360
-from rig.bench import Bench
-from rig.catalog import Catalog, ObjectSummary, clean_name
 from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Event
 from rig.motion.move import MotionTimes
-from rig.motion.scan_speed import takes_in_motion
-from rig.motion.turntable import Turntable
 
 _FLOAT_DEG: Final = 1e-6  # a limit that a float misses by rounding still counts as reached
 
@@ -68,120 +63,6 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
         )
     nearest = min(revolutions, key=lambda whole: (abs(angles[0] + 360.0 * whole), whole))
     return tuple(angle + 360.0 * nearest for angle in angles)
-
-
-class Obstacle(StrEnum):
-    """The reason why an object would not be enrolled."""
-
-    ALREADY_ENROLLED = "already_enrolled"
-    INTERRUPTED = "interrupted"
-    NOT_INTERRUPTED = "not_interrupted"
-
-
-@dataclass(frozen=True, slots=True)
-class DryRun:
-    """The plan of an enrollment that is not carried out.
-
-    ``action`` is "enroll", "resume", "replace", "skip" or "reject"; the last two have an ``obstacle``.
-    ``enrolled_views`` is the number of views that the object has already. ``angles_deg`` and ``azimuths_deg`` are those
-    of the views in their order. ``table_deg`` is the table angle before; ``travel_deg`` is the sum of all rotations,
-    unwinding included. ``in_motion`` is whether the views are taken in one revolution.
-    """
-
-    name: str
-    action: str
-    obstacle: Obstacle | None
-    enrolled_views: int
-    views: int
-    azimuths_deg: tuple[float, ...]
-    angles_deg: tuple[float, ...]
-    table_deg: float
-    limits_deg: tuple[float, float]
-    travel_deg: float
-    seconds: float
-    in_motion: bool = False
-
-
-def dry_run(
-    bench: Bench,
-    catalog: Catalog | None,
-    names: Mapping[str, int | None],
-    *,
-    views: int | None = None,
-    resume: bool = False,
-    replace: bool = False,
-    fly: bool | None = None,
-) -> tuple[DryRun, ...]:
-    """Return the plans of enrolling these objects. Nothing moves and nothing is stored.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    catalog
-        None if there is none yet.
-    names
-        Names of the objects, with their own number of views if they have one. Of several objects, complete ones are
-        skipped and interrupted ones resumed, as in a tray.
-    views, resume, replace, fly
-        As for `enroll`.
-
-    Raises `UsageError`: a name cannot be used. `LimitExceeded`: the cable budget does not allow the missing views.
-    """
-    known = {} if catalog is None else {summary.name: summary for summary in catalog.known_objects()}
-    table_deg = Turntable(bench).angle_deg()
-    limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
-    model = MotionTimes(bench.config)
-    found = []
-    for given, own_views in names.items():
-        name = clean_name(given)
-        summary = known.get(name)
-        # What the enrollment would take, from where the object before it leaves the table.
-        action, obstacle = planned_action(summary, resume=resume, replace=replace, tray=len(names) > 1)
-        planned: Sequence[float] = ()
-        if action in ("enroll", "replace"):
-            planned = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
-        missing: Sequence[int] = range(len(planned))
-        if action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
-            planned, missing = kept.enrollment.planned_azimuth_deg, kept.enrollment.missing
-        every = table_angles(planned, limits_deg, sign)
-        angles = tuple(every[index] for index in missing)
-        in_motion = takes_in_motion(bench.config, fly, tray=len(names) > 1)
-        scan = (angles[0], angles[0] + 360.0) if in_motion and angles else angles
-        stops = [table_deg, *scan, 0.0] if angles else [table_deg]
-        found.append(
-            DryRun(
-                name=name,
-                action=action,
-                obstacle=obstacle,
-                enrolled_views=summary.views if summary else 0,
-                views=len(angles),
-                azimuths_deg=tuple(planned[index] for index in missing),
-                angles_deg=angles,
-                table_deg=table_deg,
-                limits_deg=limits_deg,
-                travel_deg=sum(abs(b - a) for a, b in pairwise(stops)),
-                seconds=model.enrollment_s(table_deg, angles, in_motion=in_motion),
-                in_motion=in_motion,
-            )
-        )
-        table_deg = 0.0 if angles else table_deg
-    return tuple(found)
-
-
-def planned_action(
-    known: ObjectSummary | None, *, resume: bool = False, replace: bool = False, tray: bool = False
-) -> tuple[str, Obstacle | None]:
-    """Return what an enrollment does with an object of the catalog, as in `DryRun`; None: the catalog has none."""
-    if known is not None and known.unfinished_views is not None:
-        if resume or tray:
-            return "resume", None
-        return ("replace", None) if replace else ("reject", Obstacle.INTERRUPTED)
-    if resume:
-        return "reject", Obstacle.NOT_INTERRUPTED
-    if known is not None and known.views:
-        return ("replace", None) if replace else ("skip" if tray else "reject", Obstacle.ALREADY_ENROLLED)
-    return "enroll", None
 
 
 @dataclass(eq=False)

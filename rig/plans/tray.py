@@ -24,7 +24,6 @@ from rig.core.phrases import counted, whole
 from rig.events.events import Event, Item, SkipReason
 from rig.motion.scan_speed import takes_in_motion
 from rig.plans.enroll import enroll
-from rig.plans.estimate import planned_action
 from rig.plans.operator import Choice, Operator, Question, Subject, Unattended
 
 COLUMNS: Final = ("name", "label", "note", "views")
@@ -101,7 +100,14 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
 def left_to_enroll(catalog: Catalog, items: Sequence[TrayItem]) -> list[TrayItem]:
     """Return the objects of a tray that are not enrolled, or whose enrollment was interrupted."""
     known = {summary.name: summary for summary in catalog.known_objects()}
-    return [item for item in items if planned_action(known.get(item.name), tray=True)[0] != "skip"]
+    return [item for item in items if _action(known.get(item.name)) != "skip"]
+
+
+def _action(known: ObjectSummary | None) -> str:
+    """Return what a tray does with an object of the catalog; None: the catalog has none."""
+    if known is not None and known.unfinished_views is not None:
+        return "resume"
+    return "skip" if known is not None and known.views else "enroll"
 
 
 def enroll_tray(
@@ -138,7 +144,7 @@ def enroll_tray(
     for number, item in enumerate(items, 1):
         while True:
             known = {summary.name: summary for summary in catalog.known_objects()}.get(item.name)
-            action, _ = planned_action(known, tray=True)
+            action = _action(known)
             if action == "skip":
                 yield Item(number, len(items), item.name, "skip", SkipReason.ALREADY_ENROLLED)
                 break

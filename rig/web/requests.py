@@ -28,34 +28,22 @@ class TrayObject(_Request):
     views: Views = None
 
 
-class _Replacing(_Request):
-    resume: bool = Field(False, description="take the missing views of an interrupted enrollment")
-    replace: bool = Field(False, description="enroll again; the old views stay in use until the new ones are complete")
-
-
-class _Tray(_Request):
-    objects: Annotated[list[TrayObject], Field(min_length=1, max_length=1000)]
-    views: Views = None
-    fly: Fly = None
-
-
-class EnrollRequest(_Replacing, TrayObject):
+class EnrollRequest(TrayObject):
     """Enroll the object on the table."""
 
     kind: Literal["enroll"] = "enroll"
+    resume: bool = Field(False, description="take the missing views of an interrupted enrollment")
+    replace: bool = Field(False, description="enroll again; the old views stay in use until the new ones are complete")
     fly: Fly = None
 
 
-class TrayRequest(_Tray):
+class TrayRequest(_Request):
     """Enroll several objects one after the other. The job asks for each object, and skips those that are complete."""
 
     kind: Literal["tray"] = "tray"
-
-
-class DryRunRequest(_Replacing, _Tray):
-    """Compute what an enrollment would do. Moves nothing and stores nothing."""
-
-    kind: Literal["dry-run"] = "dry-run"
+    objects: Annotated[list[TrayObject], Field(min_length=1, max_length=1000)]
+    views: Views = None
+    fly: Fly = None
 
 
 class IdentifyRequest(_Request):
@@ -134,7 +122,6 @@ class CalibrateRequest(_Request):
 JobRequest = Annotated[
     EnrollRequest
     | TrayRequest
-    | DryRunRequest
     | IdentifyRequest
     | EmptyTableRequest
     | GotoRequest

@@ -12,9 +12,7 @@ from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
 from rig.charts.candidates import Styles, candidates_chart
 from rig.core.errors import UsageError
-from rig.core.json_form import plain
 from rig.core.next_steps import NextSteps, as_steps, steps_as_json
-from rig.core.phrases import counted, duration_words
 from rig.core.plugins import plugins
 from rig.doctor.context import open_context
 from rig.doctor.finding import Finding, finding_words
@@ -22,7 +20,7 @@ from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ra
 from rig.events.lines import next_steps, page_line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Step, Steps
 from rig.jobs.doctor import examine
-from rig.jobs.enroll import enroll, enroll_list, plan
+from rig.jobs.enroll import enroll, enroll_list
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
@@ -199,16 +197,6 @@ def _tray(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Ste
     return enroll_list(desk, items, **parameters, ask=False)
 
 
-def _dry_run(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:
-    found = plan(desk, {one.name: one.views for one in objects}, **parameters)
-    views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
-    yield JobResult(
-        {"dry_run": plain(found)},
-        f"{counted(len(found), 'object')}, {counted(views, 'view')}, about {duration_words(seconds)}. "
-        "Nothing was moved or stored.",
-    )
-
-
 def _identify(desk: ServedDesk, **parameters: Any) -> Steps[Identified | None]:
     return identify(
         desk,
@@ -247,7 +235,6 @@ def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:
 JOBS: Final[dict[type[BaseModel], Callable[..., Steps[object]]]] = {
     requests.EnrollRequest: _enroll,
     requests.TrayRequest: _tray,
-    requests.DryRunRequest: _dry_run,
     requests.IdentifyRequest: _identify,
     requests.EmptyTableRequest: take_table_image,
     requests.GotoRequest: goto,

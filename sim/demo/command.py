@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.complete import strategy_names
 from rig.cli.ui.exit_codes import EXIT_QUALITY
 from rig.cli.ui.settings import Settings
 
@@ -47,7 +46,6 @@ def demo(
         typer.Option(
             metavar="NAME",
             help="Search strategy: dense, ahbr, ... (default: identify.strategy).",
-            autocompletion=strategy_names,
         ),
     ] = None,
     fault: Annotated[

@@ -25,8 +25,7 @@ def sim_bench(
     """Run a simulated bench in real time: servo, IMU, camera and table of one world, for several programs at once.
 
     Its folder has a rig.toml, so each `rig` command in that folder uses the bench. It starts with the configuration in
-    force. Type commands such as `put mug-white` or `jam` into its terminal, or give them as arguments
-    of this command in another terminal.
+    force. Tell it what happens, such as `put mug-white` or `jam`, by this command in another terminal.
 
     Example: rig sim-bench; in a second terminal: cd sim-bench; rig sim-bench put mug-white; rig goto 90; rig stop
     """

@@ -8,7 +8,7 @@ from rig.core.errors import RigError, UsageError
 from rig.core.next_steps import Do
 from rig.core.phrases import angle_words, percent
 from sim.bench import ShelfOperator
-from sim.calibration_board import calibration_targets
+from sim.calibration_board import boards
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults, fault_kinds
 from sim.faults.schedule import FaultTrigger
@@ -62,7 +62,7 @@ class Commands:
                 self._world.put(None)
                 return "The table is empty."
             case "objects":
-                return "\n".join([*self._operator.objects, *calibration_targets(self._operator.optics)])
+                return "\n".join([*self._operator.objects, *boards(self._operator.optics)])
             case "rotate":
                 return self._rotate_by_hand(_number(_arguments(command, given, 1, 1)[0], "degrees", MAX_DEG))
             case "light":
@@ -106,7 +106,7 @@ class Commands:
     def _put(self, name: str, angle: str | None = None) -> str:
         operator = self._operator
         operator.yaw_deg = None if angle is None else _number(angle, "degrees", MAX_DEG)
-        if name not in {*operator.objects, *calibration_targets(operator.optics)}:
+        if name not in {*operator.objects, *boards(operator.optics)}:
             raise UsageError(
                 f"There is no object {name!r}.",
                 next_step="Choose a listed object. To list them: objects",

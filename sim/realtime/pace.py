@@ -1,9 +1,10 @@
 """Moves a simulated world along with the computer's clock."""
 
 import select
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from threading import RLock
+from types import MappingProxyType
 from typing import Final, Protocol
 
 from rig.core.clock import SystemClock
@@ -67,19 +68,20 @@ class RealTime:
         """Wait until the present has reached the time of the world, which is ahead after a transfer on a bus."""
         self._system.sleep((self._clock.now_ns() - self.now_ns()) * 1e-9)
 
-    def run(self, seconds: float | None = None, inputs: dict[int, Callable[[], bool]] | None = None) -> None:
+    def run(
+        self, seconds: float | None = None, inputs: Mapping[int, Callable[[], object]] = MappingProxyType({})
+    ) -> None:
         """Let the time pass for ``seconds``, or until `over` is set.
 
-        ``inputs`` are further file descriptors, each with a function to call when it is readable; False from it removes
-        it.
+        ``inputs`` are further file descriptors, each with a function to call when it is readable.
         """
         try:
-            self._run(seconds, {} if inputs is None else inputs)
+            self._run(seconds, inputs)
         finally:
             with self._lock:  # other threads do not use the world from now on
                 self.over = True
 
-    def _run(self, seconds: float | None, inputs: dict[int, Callable[[], bool]]) -> None:
+    def _run(self, seconds: float | None, inputs: Mapping[int, Callable[[], object]]) -> None:
         end_ns = None if seconds is None else self.now_ns() + round(seconds * 1e9)
         while not self.over and (end_ns is None or self.now_ns() < end_ns):
             with uninterrupted(), self.present():
@@ -90,8 +92,8 @@ class RealTime:
             except OSError:  # another thread has unplugged a port meanwhile
                 continue
             for descriptor in readable:
-                if descriptor in inputs and not inputs[descriptor]():
-                    del inputs[descriptor]
+                if descriptor in inputs:
+                    inputs[descriptor]()
 
     def _catch_up(self) -> None:
         now_ns = self.now_ns()

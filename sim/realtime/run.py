@@ -1,9 +1,6 @@
 """Runs a simulated bench in real time, in a folder with its configuration and the names of its ports."""
 
-import os
 import shutil
-import signal
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from itertools import count
@@ -29,7 +26,7 @@ from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.objects.shelf import shelf
 from sim.realtime.bench import RunningSimBench
-from sim.realtime.commands import Commands, run
+from sim.realtime.commands import Commands
 from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
 from sim.realtime.server import BenchServer
@@ -67,50 +64,16 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         operator = ShelfOperator(world, shelf())
         commands = Commands(operator, devices, faults, quit=lambda: setattr(time, "over", True))
         server = ends.enter_context(BenchServer(folder, devices, time, commands))
-        inputs: dict[int, Callable[[], bool]] = {server.fileno(): server.accept}
-        if (keyboard := _Keyboard(settings, time, commands)).usable():
-            inputs[sys.stdin.fileno()] = keyboard.read
 
         text = (
             f"The simulated bench is running in {folder}. Stop it with Ctrl+C.\n"
             f"In a second terminal: cd {folder}; then for example: rig status\n"
-            "Type what happens at the bench, for example: put mug-white. For a list: help"
+            "What happens at the bench, for example: rig sim-bench put mug-white. For a list: rig sim-bench help"
         )
         settings.say(text, {"folder": str(folder), "servo": ports[0].path, "head": config.imu.connection == "head"})
         with suppress(KeyboardInterrupt):  # Ctrl+C is the usual end
-            time.run(seconds, inputs)
+            time.run(seconds, {server.fileno(): server.handle_request})
     settings.say("The simulated bench has ended.", {"ended": True})
-
-
-class _Keyboard:
-    """Commands of the trainee from standard input."""
-
-    def __init__(self, settings: Settings, time: RealTime, commands: Commands) -> None:
-        self._settings, self._time, self._commands = settings, time, commands
-        self._text = b""
-
-    def usable(self) -> bool:
-        """Return whether there is a standard input; a program in the background gets an error instead of a stop."""
-        with suppress(OSError, ValueError, AttributeError):  # closed, or this is not the main thread
-            signal.signal(signal.SIGTTIN, signal.SIG_IGN)
-            os.fstat(sys.stdin.fileno())
-            return True
-        return False
-
-    def read(self) -> bool:
-        """Carry out the typed command; return False at the end of the input."""
-        try:
-            typed = os.read(sys.stdin.fileno(), 4096)
-        except OSError:  # in the background
-            return False
-        *lines, self._text = (self._text + typed).split(b"\n")
-        for line in lines:
-            if words := line.decode(errors="replace").split():
-                with self._time.present():
-                    answer = run(self._commands, words)
-                failed = answer.get("failed")
-                self._settings.say(f"{failed['what']} {failed['next_step']}" if failed else answer["text"], answer)
-        return bool(typed)
 
 
 def _port(open_connection: Callable[[], SerialConnection], link: Path | None, ends: ExitStack) -> PtyPort:

@@ -236,11 +236,6 @@ class BenchServer(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
         finally:
             del self._connections[request]
 
-    def accept(self) -> bool:
-        """Accept the connection that waits."""
-        self.handle_request()
-        return True
-
     def server_close(self) -> None:
         """Answer the pending requests, then end the connections."""
         super().server_close()

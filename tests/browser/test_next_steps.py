@@ -42,7 +42,7 @@ def test_errors_name_no_command_that_a_page_can_do(page, serve_process):
     page.evaluate(
         "async (steps) => (await import('/static/rig.js')).show({ message: 'No.', steps })",
         [
-            {"action": "redescribe", "parameters": {}, "command": "rig catalog redescribe"},
+            {"action": "verify-catalog", "parameters": {}, "command": "rig catalog verify"},
         ],
     )
-    assert "at a terminal of the bench's computer: rig catalog redescribe" in page.inner_text("#messages")
+    assert "at a terminal of the bench's computer: rig catalog verify" in page.inner_text("#messages")

@@ -4,15 +4,13 @@ import json
 
 import pytest
 
-from calibration import camera_light, camera_model
+from calibration import camera_model
 from rig.calibrations import CalibrationStore, RejectionCode
 
 
 @pytest.fixture
 def rig(rig, monkeypatch):
     monkeypatch.setattr(camera_model, "ANGLES_DEG", (-40.0, 0.0, 40.0))
-    for other in (camera_light.CameraNoise, camera_light.CameraCard):
-        monkeypatch.setattr(other, "measure", lambda *_: (event for event in ()))
     return rig
 
 

@@ -16,7 +16,6 @@ from typing import Any
 import sqlalchemy
 
 from rig.catalog import Catalog, derived
-from rig.catalog.copying import copy_catalog
 from rig.catalog.facts import Derived
 from rig.catalog.jobs import finished
 from rig.catalog.results import correct, find_results
@@ -96,18 +95,6 @@ def replace(catalog: Catalog, _: Report) -> None:
         finished(transfer(CatalogSource(other), catalog, conflict=Conflict.REPLACE, jobs=1))
 
 
-def copied(catalog: Catalog, _: Report) -> None:
-    if not (catalog.path.parent / "copy").exists() or not _copy_is_complete(catalog):
-        shutil.rmtree(catalog.path.parent / "copy", ignore_errors=True)
-        with opened(catalog.path.parent, "copy") as target:
-            finished(copy_catalog(catalog, target))
-
-
-def _copy_is_complete(catalog: Catalog) -> bool:
-    with opened(catalog.path.parent, "copy") as target:
-        return len(target.log()) == len(catalog.log())
-
-
 def delete(catalog: Catalog, _: Report) -> None:
     if any(one.name == "mug" for one in catalog.objects()):
         catalog.delete("mug", "tin")
@@ -140,7 +127,7 @@ def put_right(catalog: Catalog, _: Report) -> None:
 def describe(catalog: Catalog, _: Report) -> None:
     with catalog.database.write() as transaction:
         transaction.execute(sqlalchemy.delete(Derived))  # nothing of it is a fact: all of it is computed again
-    finished(derived.redescribe(catalog, jobs=1))
+    derived.views(catalog)
 
 
 WORK: dict[str, Callable[[Catalog, Report], None]] = {
@@ -149,7 +136,6 @@ WORK: dict[str, Callable[[Catalog, Report], None]] = {
     "continue": continue_,
     "transfer": move,
     "replace": replace,
-    "copy": copied,
     "delete": delete,
     "restore": restore,
     "gc": gc,

@@ -23,7 +23,6 @@ COMMANDS = {
     "rename": ("catalog", "rename", "lamp", "lantern"),
     "delete": ("catalog", "delete", "lamp", "--yes"),
     "gc": ("catalog", "gc", "--yes"),
-    "redescribe": ("catalog", "redescribe", "--descriptor", "edges", "--jobs", "1"),
     "verify": ("catalog", "verify"),
     "configuration": ("config", "set", "identify.max_views", "5"),
     "tray": ("enroll", "--list", "tray.csv", "--yes"),

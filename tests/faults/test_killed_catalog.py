@@ -26,7 +26,7 @@ from tests.rig.catalog.catalog_samples import without_waiting
 
 KILLS = int(os.environ.get("RIG_TEST_KILLS", "1"))
 """Kills of each kind of work; `make test-kills` asks for more."""
-SIMILAR = ("continue", "replace", "copy", "restore", "rename", "correct", "describe")
+SIMILAR = ("continue", "replace", "restore", "rename", "correct", "describe")
 """Work that stores as other work does; with one kill, only the nightly tests do it."""
 VIEW_BY_VIEW = {"enroll": "new", "enroll again": "mug", "continue": "begun"}
 """Work that keeps each view, and its object; all other work takes effect as a whole or not at all."""
@@ -44,9 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def state(home: Path) -> dict[str, Any]:
     """Return everything that the catalogs of a folder tell, but for times, ids and computed data."""
     found: dict[str, Any] = {}
-    for name in ("catalog", "other", "copy"):
-        if not (home / name).exists():
-            continue
+    for name in ("catalog", "other"):
         with opened(home, name) as catalog:
             found[name] = {
                 one.name: (one.label, [_enrollment(each) for each in catalog.object(one.name).enrollments])
@@ -109,8 +107,6 @@ def check_interrupted(
             assert len(present - there - set(reported)) <= 1  # stored, and not reported any more
         for other in before["catalog"].keys() - {VIEW_BY_VIEW[name], "searched"}:
             assert found["catalog"][other] == before["catalog"][other]
-    elif name == "copy":
-        assert found["catalog"] == before["catalog"]
     else:
         assert found in (before, complete), "it takes effect as a whole or not at all"
     run(name, home, lambda _: None)

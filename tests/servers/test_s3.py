@@ -16,7 +16,6 @@ import pytest
 from sqlalchemy import text
 
 from rig.catalog import Catalog, derived
-from rig.catalog.copying import copy_catalog
 from rig.catalog.images import FsspecImages
 from rig.catalog.jobs import finished
 from rig.catalog.results import record as record_result
@@ -27,7 +26,7 @@ from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, CatalogUnavailable
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, new_result
+from tests.rig.catalog.catalog_samples import fill, image, new_result
 from tests.servers.postgres import PostgresServer, place_in
 
 
@@ -154,32 +153,6 @@ def test_objects_are_imported_into_s3(postgres: PostgresServer, s3: S3Server, tm
         finished(transfer(CatalogSource(local), catalog))
         assert derived.views(catalog).object_names == ("mug",)
         assert finished(verify(catalog, jobs=1)).findings == ()
-
-
-def test_copies_in_both_directions_are_equal(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
-    with opened(tmp_path / "local") as local, opened(in_s3(postgres, tmp_path / "shared")) as shared:
-        fill(local, "mug", 2, 0)
-        fill(local, "gone", 1, 5)
-        local.delete("gone")
-        collect_garbage(local)
-        fill(local, "tin", 2, 10)
-        local.begin("half", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
-        record_result(local, new_result(), image(77))
-        done = finished(copy_catalog(local, shared))
-        assert (done.objects, done.views, done.results, done.images) == (3, 4, 1, 5)
-        assert shared.version() == local.version()
-        assert finished(verify(shared, jobs=1)).findings == ()
-        with pytest.raises(CatalogError, match="not empty"):
-            finished(copy_catalog(local, shared))
-        with opened(tmp_path / "back") as back:
-            finished(copy_catalog(shared, back))
-            assert back.version() == local.version()
-            assert finished(verify(back, jobs=1)).findings == ()
-            assert [entry.action for entry in back.log()][-2:] == ["copied", "copied"]
-            ids = [[catalog.object(name).complete.id for name in ("mug", "tin")] for catalog in (local, back)]
-            assert ids[0] == ids[1]
-            fill(back, "new", 1, 20)
-            fill(shared, "new", 1, 20)
 
 
 def test_transaction_without_locks_may_wait_and_one_with_locks_may_not(

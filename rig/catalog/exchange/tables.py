@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from hbr.descriptors import descriptor
-from rig.catalog.derived import described, regions_of
+from rig.catalog.derived import described
 from rig.catalog.exchange.new_files import new_file, new_folder
 from rig.catalog.facts import Enrollment, View
 from rig.catalog.images import path_of
@@ -79,11 +79,10 @@ class TableFormat(StrEnum):
 
 
 class ExportedObject(NamedTuple):
-    """An object and its complete enrollment, with the part of the image that is described of each view."""
+    """An object and its complete enrollment."""
 
     item: TransferItem
     enrollment: Enrollment
-    regions: tuple[Region | None, ...]
 
 
 def enrolled(source: CatalogSource) -> Iterator[ExportedObject]:
@@ -91,7 +90,7 @@ def enrolled(source: CatalogSource) -> Iterator[ExportedObject]:
     for item in source.items():
         for one in item.enrollments:
             if one.status is EnrollmentStatus.COMPLETE:
-                yield ExportedObject(item, one.enrollment, regions_of(source.catalog, one.enrollment))
+                yield ExportedObject(item, one.enrollment)
 
 
 def write_folder(folder: Path, source: CatalogSource) -> int:
@@ -192,9 +191,9 @@ def parse_region(text: str) -> Region | None:
 def _rows(source: CatalogSource, one: ExportedObject) -> Iterator[tuple[dict[str, Any], View]]:
     """Yield the views of an object, each with its row: the columns `VIEWS`."""
     kind = descriptor(PAPER_DESCRIPTOR)
-    item, enrollment, regions = one
+    item, enrollment = one
     levels_of = described(source.catalog, enrollment, item.name, kind.name).levels[kind.name]
-    for view, region, levels in zip(enrollment.views, regions, levels_of, strict=True):
+    for view, levels in zip(enrollment.views, levels_of, strict=True):
         by = enrollment.sessions[view.session].provenance
         row = {
             "object": item.name,
@@ -208,7 +207,7 @@ def _rows(source: CatalogSource, one: ExportedObject) -> Iterator[tuple[dict[str
             "evidence": json.dumps(view.evidence, ensure_ascii=False),
             "image": path_of(view.image),
             "image_sha256": Path(view.image).stem,
-            "region": "" if region is None else " ".join(map(str, region)),
+            "region": "" if view.region is None else " ".join(map(str, view.region)),
             "descriptor": kind.name,
             "descriptor_version": kind.version,
             "levels": levels.tolist(),

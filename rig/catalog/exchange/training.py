@@ -31,7 +31,7 @@ from rig.config import ViewConfig
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import ExportFailed
 from rig.core.next_steps import Do
-from rig.core.processes import Jobs, map_in_processes
+from rig.core.processes import map_in_processes
 from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber, within
 from rig.views.image_files import IMAGE_FOLDER
 
@@ -63,7 +63,6 @@ class _Picture(NamedTuple):
     number: int
     view: View
     session: Session
-    region: Region | None
     segmentation: str
 
 
@@ -87,7 +86,7 @@ def write_training(
     source: CatalogSource,
     form: Annotations,
     *,
-    jobs: Jobs | None = None,
+    jobs: int | None = None,
 ) -> Generator[JobProgress, None, TrainingExport]:
     """Write the views that searches use as a training set into a new folder, all or nothing.
 
@@ -106,11 +105,11 @@ def write_training(
             yield from transfer(CatalogSource(source.catalog, source.names, used_only=True), copy, jobs=jobs)
         # Describe the views that are not described yet. Of several views with the same image the first is used.
         pictures: dict[str, _Picture] = {}
-        for number, (item, enrollment, regions) in enumerate(objects):
+        for number, (item, enrollment) in enumerate(objects):
             yield JobProgress(number, len(objects))
             evidence = described(source.catalog, enrollment, item.name).segmentation
-            for view, region, found in zip(enrollment.views, regions, evidence, strict=True):
-                own = (number, view, enrollment.sessions[view.session], region, json.dumps(found))
+            for view, found in zip(enrollment.views, evidence, strict=True):
+                own = (number, view, enrollment.sessions[view.session], json.dumps(found))
                 pictures.setdefault(view.image, _Picture(len(pictures), *own))
         # Find the objects in the images, in processes.
         masks: dict[int, _Mask] = {}
@@ -122,7 +121,7 @@ def write_training(
         parts: dict[str, list[_Annotated]] = {part: [] for part in PARTS}
         for picture in pictures.values():
             parts[_PART_OF.get(picture.view.index % 10, "train")].append((picture, masks[picture.id]))
-        items = [item for item, *_ in objects]
+        items = [item for item, _ in objects]
         if form is Annotations.COCO:
             _write_coco(made, items, parts)
         else:
@@ -141,12 +140,12 @@ def _masks(folder: Path, portion: tuple[_Picture, ...]) -> list[_Mask]:
 
 def _mask(folder: Path, picture: _Picture) -> _Mask:
     image = FolderImages(folder).pixels(picture.view.image)
-    describer = _describer(folder, picture.region, picture.session.empty_table)
+    describer = _describer(folder, picture.view.region, picture.session.empty_table)
     found = describer.segment(image, picture.view.azimuth_deg, json.loads(picture.segmentation))
     height, width = image.shape[:2]
-    x0, y0, w, h = picture.region or (0, 0, width, height)
+    x0, y0, w, h = picture.view.region or (0, 0, width, height)
     whole = np.zeros((height, width), np.bool_)
-    part = within(whole, picture.region)  # type: ignore[arg-type] # a view of it
+    part = within(whole, picture.view.region)  # type: ignore[arg-type] # a view of it
     part[:] = found.frame_mask(w, h)
     if found.box is None or not part.any():
         part[:] = True
@@ -213,7 +212,7 @@ def _write_coco(folder: Path, items: Sequence[TransferItem], parts: _Parts) -> N
                 "id": picture.id + 1,
                 "image_id": picture.id + 1,
                 "category_id": picture.number + 1,
-                "bbox": list(mask.box or picture.region or (0, 0, mask.width, mask.height)),
+                "bbox": list(mask.box or picture.view.region or (0, 0, mask.width, mask.height)),
                 "area": sum(mask.counts[1::2]),
                 "segmentation": {"size": [mask.height, mask.width], "counts": mask.counts},
                 "iscrowd": int(mask.box is None),  # a region that trainers and evaluators ignore

@@ -22,11 +22,10 @@ app = typer.Typer(help="Show the servo's registers, and change its settings, id 
 @app.command("info")
 @command
 def info(settings: Settings) -> None:
-    """Show every register of the servo with its meaning and unit. Writes nothing.
+    """Show every register of the servo, as numbers of the e-manual. Writes nothing.
 
     Example: rig servo info --bench sim
     """
-    from rig.doctor.register_meaning import meaning
     from rig.doctor.single_servo import single_servo
 
     with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
@@ -39,7 +38,6 @@ def info(settings: Settings) -> None:
                     name: {
                         "address": servo.table[name].address,
                         "value": value,
-                        "meaning": meaning(servo.table, name, value),
                         "kept_without_supply": servo.table[name].address < servo.table.ram_start,
                     }
                     for name, value in values.items()
@@ -55,7 +53,7 @@ def info(settings: Settings) -> None:
         if (now := register.address < servo.table.ram_start) is not kept:
             kept = now
             print("\nEEPROM: kept without supply" if kept else "\nRAM: lost without supply")
-        print(f"  {register.address:3d}  {name:24s}{value:12d}  {meaning(servo.table, name, value)}".rstrip())
+        print(f"  {register.address:3d}  {name:24s}{value:12d}")
 
 
 @app.command("settings")

@@ -12,7 +12,7 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
-from rig.cli.ui.options import ClusterOption, JobsOption, jobs_of
+from rig.cli.ui.options import JobsOption
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
@@ -72,7 +72,6 @@ def import_(
     ] = "reject",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
     jobs: JobsOption = None,
-    cluster: ClusterOption = None,
 ) -> None:
     """Import photographs with known angles, or objects of another catalog with all their enrollments; all or nothing.
 
@@ -95,7 +94,7 @@ def import_(
             conflict=Conflict(on_conflict),
             label=label,
             descriptors=DESCRIPTORS,
-            jobs=jobs_of(jobs, cluster),
+            jobs=jobs,
             dry_run=dry_run,
         )
         what = "checking" if dry_run else "importing"

@@ -1,11 +1,10 @@
-"""`rig catalog verify`, `redescribe`, `gc`, `copy` and `deliver`: the catalog as a whole.
+"""`rig catalog verify`, `gc` and `deliver`: the catalog as a whole.
 
 Decision: docs/decisions/0010.
 """
 
 import sys
-from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -13,15 +12,12 @@ from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_CATALOG
 from rig.cli.ui.jobs import run_job, size_words
-from rig.cli.ui.options import ClusterOption, JobsOption, YesOption, jobs_of
+from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 from rig.core.phrases import counted
-
-_SHOWN: Final = 20
-"""Failed objects that are listed; --json has all."""
 
 
 @app.command("verify")
@@ -44,57 +40,6 @@ def verify(settings: Settings) -> None:
     summary = f"{checked}, {size_words(found.image_bytes)} of images: {outcome}"
     settings.say("\n".join([*(finding.text for finding in found.findings), summary]), found)
     if found.findings:
-        raise typer.Exit(EXIT_CATALOG)
-
-
-@app.command("redescribe")
-@command
-def redescribe(
-    settings: Settings,
-    descriptor: Annotated[str, typer.Option(help="Name of the descriptor.")] = "cedd",
-    region: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,WIDTH,HEIGHT|whole",
-            help="From now on, describe this part of the images, in pixels, or the whole.",
-        ),
-    ] = None,
-    jobs: JobsOption = None,
-    cluster: ClusterOption = None,
-) -> None:
-    """Describe the enrolled views now: those that no search has described since the program or the region changed.
-
-    A search does this, too. After an interruption, the same command continues.
-
-    Example: rig catalog redescribe --region 40,0,240,240 --bench sim
-
-    Example: rig catalog redescribe --descriptor edges+colours+cedd --bench sim
-    """
-    from rig.catalog.derived import choose_region
-    from rig.catalog.derived import redescribe as job
-    from rig.catalog.describing import known_descriptor
-    from rig.catalog.exchange.tables import parse_region
-
-    name = known_descriptor(descriptor).name
-    try:
-        part = None if region in (None, "whole") else parse_region(region)
-    except ValueError as error:
-        raise UsageError(f"--region: {error}.", next_step="Give X,Y,WIDTH,HEIGHT, or whole.") from error
-    with settings.open_catalog() as catalog:
-        if region is not None:
-            choose_region(catalog, part)
-        interrupted = (
-            f"Interrupted; the results so far are stored. To continue: rig catalog redescribe --descriptor {name}"
-        )
-        done = run_job("describing", job(catalog, name, jobs=jobs_of(jobs, cluster)), interrupted=interrupted)
-    settings.say(
-        f"{done.descriptor} {done.version}: {counted(done.described, 'view')} described, "
-        f"{done.unchanged} unchanged, {len(done.failed)} failed",
-        done,
-    )
-    for path, reason in done.failed[:_SHOWN]:
-        print(f"  {path}: {reason}", file=sys.stderr)
-    if done.failed:
         raise typer.Exit(EXIT_CATALOG)
 
 
@@ -127,44 +72,6 @@ def gc(
             found = collect_garbage(catalog, old=old)
     text = f"{'Would remove' if dry_run else 'Removed'} {words}."
     settings.say("There is nothing to remove." if nothing else text, {"dry_run": dry_run, **plain(found)})
-
-
-@app.command("copy")
-@command
-def copy(
-    settings: Settings,
-    source: Annotated[str, typer.Argument(metavar="FROM", help="Folder or database URL of the catalog.")],
-    target: Annotated[str, typer.Argument(metavar="TO", help="Folder or database URL of a new or empty catalog.")],
-) -> None:
-    """Copy a whole catalog, for example from this computer to a server, and compare all digests.
-
-    The images of a database are in the store that the setting catalog.images names.
-
-    Example: rig catalog copy ~/catalog postgresql+psycopg://rig@server/rig --set catalog.images=s3://rig/catalog
-    """
-    from rig.catalog import Catalog
-    from rig.catalog.copying import copy_catalog
-    from rig.config.catalog_place import CatalogPlace
-
-    def place(text: str) -> CatalogPlace:
-        if "://" not in text:
-            return CatalogPlace(Path(text))
-        config = settings.load()
-        return CatalogPlace(config.catalog_path(settings.bench_name), text, config.catalog.images)
-
-    clock = SystemClock()
-    with (
-        Catalog.open(place(source), clock=clock, create=False, read_only=True) as before,
-        Catalog.open(place(target), clock=clock, create=True) as after,
-    ):
-        interrupted = "Interrupted; the copy is empty. The same command continues with the images."
-        done = run_job("copying", copy_catalog(before, after), interrupted=interrupted)
-        words = (
-            f"Copied {counted(done.objects, 'object')} with {counted(done.views, 'view')}, "
-            f"{counted(done.results, 'result')} and {size_words(done.image_bytes)} of images from {before.place} to "
-            f"{after.place}. All digests are equal."
-        )
-    settings.say(words, done._asdict())
 
 
 @app.command("deliver")

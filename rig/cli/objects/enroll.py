@@ -16,13 +16,12 @@ from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from rig.cli.ui.desk import CommandDesk
     from rig.cli.ui.live import EnrollView
     from rig.events.events import Event
     from rig.jobs.desk import Steps
-    from rig.plans.estimate import DryRun
     from rig.report import EnrollmentRecord
 
 
@@ -56,9 +55,6 @@ def enroll(
         bool,
         typer.Option("--fly", help="Take the views in one revolution without a stop (default: enroll.mode)."),
     ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only show the plan: views, duration, table angles. Nothing moves.")
-    ] = False,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write an HTML page with all views and measurements.")
     ] = None,
@@ -83,7 +79,6 @@ def enroll(
     from rig.cli.ui.desk import CommandDesk
     from rig.jobs.enroll import enroll as enroll_job
     from rig.jobs.enroll import enroll_list
-    from rig.jobs.enroll import plan as planned
     from rig.plans.tray import read_tray
 
     # Reject wrong options before a device is opened.
@@ -93,11 +88,6 @@ def enroll(
     if report is not None:
         _check_writable(report)
     items = read_tray(tray) if tray else ()
-    if dry_run:
-        names = {name: None} if name else {item.name: item.views for item in items}
-        plan = planned(CommandDesk(settings), names, resume=resume, replace=replace, **how)
-        _print_plan(settings, plan)
-        return
 
     continued = [name, "--resume"] if name is not None else ["--list", str(tray)]
     others = "" if name is not None else " with the other objects"
@@ -250,14 +240,3 @@ def _check_writable(report: Path) -> None:
             next_step="Choose another file with --report.",
             evidence={"reason": reason},
         )
-
-
-def _print_plan(settings: Settings, found: "Sequence[DryRun]") -> None:
-    from rig.cli.ui.present import console, dry_run_lines
-
-    if settings.json:
-        settings.print_json({"dry_run": found})
-        return
-    screen = console()
-    for line in dry_run_lines(found):
-        screen.print(line, markup=False, highlight=False, soft_wrap=not screen.is_terminal)

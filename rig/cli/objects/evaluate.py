@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.options import ClusterOption, JobsOption, jobs_of
+from rig.cli.ui.options import JobsOption
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 
@@ -53,7 +53,6 @@ def evaluate(
         typer.Option(metavar="FILE", help="Errors of the orientation: a result imu.rotation of rig calibrate imu."),
     ] = None,
     jobs: JobsOption = None,
-    cluster: ClusterOption = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="Folder for the results (default: one in rig-eval for these settings)."),
@@ -100,7 +99,7 @@ def evaluate(
                 if settings.json:
                     settings.print_json({"event": event, "object": name})
 
-            results = run_experiment(asked, dataset, jobs_of(jobs, cluster) or os.cpu_count() or 1, advance)
+            results = run_experiment(asked, dataset, jobs or os.cpu_count() or 1, advance)
     except ValueError as error:
         raise UsageError(str(error), next_step="Correct the experiment, the options or the data set.") from error
     # The files first: they are the result, the tables below only show it.

@@ -4,15 +4,11 @@ import inspect
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args, get_type_hints
+from typing import Annotated, Any, TypedDict, get_args, get_type_hints
 
 import typer
 
 from rig.cli.ui.complete import bench_names
-from rig.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from rig.core.processes import Jobs
 
 COMMON: str = "Common options"
 """Panel of the help."""
@@ -56,13 +52,6 @@ class CommonOptions(TypedDict):
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")]
-ClusterOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Work on a Dask cluster: the address of its scheduler, or local, or local:WORKERS.",
-    ),
-]
 
 
 def spread(function: Callable[..., Any]) -> list[inspect.Parameter]:
@@ -89,17 +78,3 @@ def show_parameters(command: Callable[..., Any], parameters: Sequence[inspect.Pa
     """Let Typer take these parameters for those of a command: it reads the signature and the annotations."""
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {one.name: one.annotation for one in parameters}
-
-
-def jobs_of(jobs: int | None, cluster: str | None) -> "Jobs | None":
-    """Return where the work is done.
-
-    Raises `UsageError`: both are given.
-    """
-    from rig.core.cluster import Cluster
-
-    if cluster is None:
-        return jobs
-    if jobs is not None:
-        raise UsageError("--jobs and --cluster are both given.", next_step="Give one of them; local:2 has 2 workers.")
-    return Cluster(cluster)

@@ -1,4 +1,4 @@
-"""Tables, progress bars and the text of dry runs on a terminal.
+"""Tables and progress bars on a terminal.
 
 This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
 """
@@ -17,11 +17,9 @@ from rich.text import Text
 
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
-from rig.core.phrases import angle_range, angle_words, azimuth_words, counted, duration_words
 
 if TYPE_CHECKING:
     from rig.catalog.jobs import JobProgress
-    from rig.plans.estimate import DryRun
 
 _PIPE_COLUMNS: Final = 240  # no row of a table is cut for a program that reads it
 
@@ -66,53 +64,6 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right:
         cells = zip(columns, line, spaces, strict=True)
         print("  ".join(space + cell if name in right else cell + space for name, cell, space in cells).rstrip())
     sys.stdout.flush()
-
-
-def dry_run_lines(found: "Sequence[DryRun]") -> list[str]:
-    """Return the plan of enrollments, in lines."""
-    lines = []
-    for one in found:
-        if not one.views:
-            lines.append(f"{one.name}: {'skipped' if one.action == 'skip' else 'not possible'}, {_obstacle_words(one)}")
-            continue
-        way = " in one revolution" if one.in_motion else ""
-        lines.append(
-            f"{one.name}: {one.action}, {counted(one.views, 'view')}{way}, about {duration_words(one.seconds)}"
-        )
-        if len(found) > 1:
-            continue
-        first, last = one.angles_deg[0], one.angles_deg[-1]
-        lines += [
-            f"  The table is at {angle_words(one.table_deg)}. {_beginning(one.table_deg, first)}, rotates up to "
-            f"{angle_words(last)} and back to 0°: {one.travel_deg:.0f}° of rotation.",
-            f"  The cable budget is {angle_range(one.limits_deg)}.",
-            "  Table angles: " + ", ".join(angle_words(angle) for angle in one.angles_deg),
-            "  Azimuths:     " + ", ".join(f"{azimuth_words(azimuth)}°" for azimuth in one.azimuths_deg),
-        ]
-    if len(found) > 1:
-        views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
-        lines.append(f"{counted(len(found), 'object')}, {counted(views, 'view')}, about {duration_words(seconds)}")
-    return [*lines, "Nothing was moved or stored."]
-
-
-def _obstacle_words(one: "DryRun") -> str:
-    from rig.plans.estimate import Obstacle
-
-    match one.obstacle:
-        case Obstacle.INTERRUPTED:
-            return "its enrollment was interrupted: add --resume or --replace"
-        case Obstacle.NOT_INTERRUPTED:
-            return "it has no interrupted enrollment: remove --resume"
-        case _:
-            hint = "" if one.action == "skip" else ": add --replace to enroll it again"
-            return f"it is already enrolled, with {counted(one.enrolled_views, 'view')}{hint}"
-
-
-def _beginning(table_deg: float, first_deg: float) -> str:
-    if abs(table_deg - first_deg) < 1:
-        return "It starts there"
-    verb = "unwinds" if abs(table_deg) - abs(first_deg) > 180 else "rotates"
-    return f"It first {verb} to {angle_words(first_deg)}"
 
 
 class ProgressBar(AbstractContextManager["ProgressBar"]):

@@ -1,9 +1,4 @@
-import { $, act, followJobs, h, on, request, start, submit, table } from "./rig.js";
-
-$("dry").addEventListener("click", () => {
-  if (!$("one").reportValidity()) return;
-  submit({ kind: "dry-run", objects: [{ name: $("name").value, views: $("views").value ? Number($("views").value) : null }], replace: $("replace").checked });
-});
+import { $, act, followJobs, h, on, start, submit, table } from "./rig.js";
 
 // -- the tray ------------------------------------------------------------------------------------------------------------
 
@@ -45,7 +40,6 @@ $("file").addEventListener("change", () => act(async () => {
   table(preview, ["Name", "Label", "Note", "Views"], objects.map((one) => [one.name, one.label, one.note, one.views]));
   $("rows").replaceChildren(preview);
   $("tray-start").disabled = objects.length === 0;
-  await request("POST", "/jobs", { kind: "dry-run", objects });
 }));
 $("tray").addEventListener("submit", (event) => {
   event.preventDefault();
@@ -63,5 +57,5 @@ on("shown-plan", (event) => {
   if (event.event === "rejected") $("thumbs").append(h("li", { class: "error" }, event.text));
   if (event.event === "similar_objects") $("similar").replaceChildren(...event.text.split("\n").map((words) => h("li", {}, words)));
 });
-followJobs(["enroll", "tray", "dry-run"], (job, isOther) => { if (isOther) $("similar").replaceChildren(); }, checks);
+followJobs(["enroll", "tray"], (job, isOther) => { if (isOther) $("similar").replaceChildren(); }, checks);
 start();

@@ -310,7 +310,7 @@ on("stop", ({ ended, torque_off: torqueOff }) => {
 
 // -- a job ---------------------------------------------------------------------------------------------------------------
 
-const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", reference: "Set the angle", doctor: "Check the bench", calibrate: "Calibrate", "dry-run": "Plan" };
+const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", reference: "Set the angle", doctor: "Check the bench", calibrate: "Calibrate" };
 const ENDED = ["done", "failed", "cancelled", "interrupted"];
 const ACTIVE = ["running", "paused", "waiting"];
 const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "Stop" };

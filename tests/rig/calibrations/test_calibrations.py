@@ -45,9 +45,9 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
     value=finite,
     uncertainty=finite,
     residual=st.none() | finite,
-    rejections=st.lists(st.builds(CalibrationRejection, st.just(RejectionCode.SAMPLES_LOST), st.just({"lost": 7}))).map(
-        tuple
-    ),
+    rejections=st.lists(
+        st.builds(CalibrationRejection, st.just(RejectionCode.WRONG_DIRECTION), st.just({"ratio": -1.0}))
+    ).map(tuple),
     when=st.datetimes(datetime(1971, 1, 1), datetime(2200, 1, 1)),
 )
 def test_written_result_is_read_again(tmp_path, value, uncertainty, residual, rejections, when):

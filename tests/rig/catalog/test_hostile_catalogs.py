@@ -24,7 +24,7 @@ from rig.catalog.images import path_of
 from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
 from rig.catalog.transfer import CatalogSource, transfer
-from rig.catalog.upkeep import collect_garbage, statistics
+from rig.catalog.upkeep import collect_garbage
 from rig.catalog.verify import CatalogProblem, verify
 from rig.core.errors import CatalogDamaged, RigError
 from rig.core.files import write
@@ -161,7 +161,6 @@ READERS: dict[str, Callable[[Catalog, Path], Any]] = {
     "show": lambda catalog, _: [catalog.read_image(view.image) for view in catalog.object("mug").views],
     "identify": answer,
     "log": lambda catalog, _: (catalog.log(), find_results(catalog)),
-    "statistics": lambda catalog, _: statistics(catalog),
     "enroll again": lambda catalog, _: fill(catalog, "mug", 2, replace=True),
     "continue": lambda catalog, _: catalog.resume("tin", provenance=PROVENANCE),
     "rename": lambda catalog, _: catalog.rename("mug", "cup"),
@@ -252,7 +251,7 @@ def rollback_journal(database: Path, *, names: Path | None) -> bytes:
 
 COMMANDS = (
     *("catalog gc --yes", "catalog verify", "catalog delete mug --yes", "catalog rename mug cup"),
-    *("catalog redescribe --jobs 1", "catalog label mug lab", "import photographs --jobs 1"),
+    *("catalog label mug lab", "import photographs --jobs 1"),
     *("enroll cup --views 4", "import other --jobs 1", "export a.zip", "catalog list", "identify"),
 )
 
@@ -323,17 +322,6 @@ def test_catalog_that_is_opened_for_writing_has_a_write_ahead_log(root: Path) ->
     with opened(root) as catalog:
         assert finished(verify(catalog, jobs=1)).findings == ()
     assert (root / "catalog.sqlite").read_bytes()[18:20] == b"\2\2"
-
-
-def test_completion_reads_no_catalog_with_a_journal(root: Path, rig: Callable[..., Result]) -> None:
-    def completed() -> str:
-        return rig(
-            env={"_RIG_COMPLETE": "complete_bash", "COMP_WORDS": "rig catalog show m", "COMP_CWORD": "3"}
-        ).stdout.strip()
-
-    assert completed() == "mug"
-    os.mkfifo(root / "catalog.sqlite-journal")
-    assert completed() == ""
 
 
 @pytest.mark.parametrize("name", ["link", "3f", "3f/link.png"])
@@ -593,7 +581,6 @@ def reported(root: Path) -> Any:
             ascii([item.views for item in details]),
             (loaded.descriptors.tolist(), loaded.azimuth_deg.tolist(), loaded.object_names, catalog.version()),
             ascii(catalog.log()),
-            statistics(catalog).enrollments,
             ascii([(item.name, item.label, item.keys) for item in CatalogSource(catalog).items()]),
             find_results(catalog),
         )

@@ -14,7 +14,7 @@ from rig.catalog.facts import Derived
 from rig.catalog.results import find_result
 from rig.catalog.results import record as record_result
 from rig.catalog.state import used
-from rig.catalog.upkeep import YOUNG_S, collect_garbage, statistics
+from rig.catalog.upkeep import YOUNG_S, collect_garbage
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
 from rig.core.next_steps import Do
@@ -199,17 +199,3 @@ class TestGarbage:
         assert collect_garbage(catalog, dry_run=True).files == 1
         catalog.database.images.put(content)
         assert collect_garbage(catalog).files == 0
-
-    def test_statistics_count_everything(self, catalog: Catalog) -> None:
-        fill(catalog, "mug", 2, 0, label="kitchen")
-        fill(catalog, "tin", 3, 10)
-        fill(catalog, "tin", 1, 20, replace=True)
-        catalog.begin("jar", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
-        catalog.delete("mug")
-        record_result(catalog, new_result(), image(40))
-        found = statistics(catalog)
-        assert (found.objects, found.deleted_objects, found.views, found.results) == (2, 1, 6, 1)
-        assert found.enrollments == {"complete": 2, "in progress": 1, "superseded": 1}
-        sizes = sum((catalog.path / name).stat().st_size for name in files(catalog))
-        assert found.image_bytes + found.result_image_bytes == sizes
-        assert found.log_entries == len(catalog.log())

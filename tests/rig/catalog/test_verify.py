@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hbr
 from hbr.descriptors import descriptor, registry
 from hbr.descriptors.cedd import Cedd
 from rig.catalog import Catalog, derived
@@ -23,7 +22,6 @@ from tests.rig.catalog.catalog_samples import (
     forget,
     image,
     plan,
-    record,
     sql,
 )
 
@@ -180,19 +178,17 @@ def test_every_problem_has_words_and_a_next_step(problem: CatalogProblem) -> Non
         assert words.count("; ") == 2
 
 
-class TestRedescribe:
+class TestDescribe:
     def test_new_version_of_a_descriptor_is_computed(self, catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
         fill(catalog, "mug", 3, 0)
         fill(catalog, "tin", 2, 10)
         monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
-        done = finished(derived.redescribe(catalog))
-        assert (done.version, done.described, done.unchanged, done.failed) == (2, 5, 0, ())
+        assert list(derived.load_views(catalog, "cedd")) == [JobProgress(done, 2) for done in (0, 1, 2)]
         assert len(derived.views(catalog)) == 5
-        assert finished(derived.redescribe(catalog)).described == 0
+        assert list(derived.load_views(catalog, "cedd")) == []
 
     def test_another_descriptor_is_added(self, catalog: Catalog) -> None:
         fill(catalog, "mug", 3, 0, REGION)
-        assert finished(derived.redescribe(catalog, "cedd-blurred")).described == 3
         wanted = descriptor("cedd-blurred").describe(np.ascontiguousarray(image(1)[:, 4:28]))
         assert np.array_equal(derived.views(catalog, "cedd-blurred").descriptors[1], wanted)
         fill(catalog, "tin", 2, 10)
@@ -200,40 +196,20 @@ class TestRedescribe:
         with pytest.raises(UsageError, match="sift"):
             derived.views(catalog, "sift")
 
-    def test_region_is_not_applied_to_imported_views(self, catalog: Catalog) -> None:
-        fill(catalog, "mug", 2, 0, REGION)
-        imported = PROVENANCE.__class__("", {})
-        enrollment = catalog.begin("postcard", planned_azimuth_deg=plan(1), provenance=imported)
-        enrollment.add(record(0, commanded_deg=None, encoder_deg=None, captured_ns=None), image(20))
-        enrollment.finish()
-        derived.choose_region(catalog, (0, 0, 20, 20))
-        done = finished(derived.redescribe(catalog))
-        assert (done.described, done.unchanged) == (2, 1)
-        levels = derived.views(catalog).descriptors
-        assert np.array_equal(levels[0], hbr.describe(np.ascontiguousarray(image(0)[:20, :20])))
-        assert np.array_equal(levels[2], hbr.describe(image(20)))
-        assert finished(verify(catalog, jobs=1)).findings == ()
-        derived.choose_region(catalog, (0, 0, 100, 20))
-        (failed,) = finished(derived.redescribe(catalog)).failed
-        assert failed[0] == "mug"
-        assert "does not lie within an image of 32x24" in failed[1]
-
     def test_interrupted_job_continues(self, catalog: Catalog) -> None:
         for number in range(3):
             fill(catalog, f"mug-{number}", 2, 10 * number)
         forget(catalog)
-        job = derived.redescribe(catalog, jobs=1)
+        job = derived.load_views(catalog, "cedd")
         assert list(itertools.islice(job, 2)) == [JobProgress(0, 3), JobProgress(1, 3)]
         job.close()
-        done = finished(derived.redescribe(catalog, jobs=1))
-        assert (done.described, done.unchanged) == (4, 2)
+        assert next(derived.load_views(catalog, "cedd")) == JobProgress(0, 2)
 
     def test_missing_image_fails_its_object(self, catalog: Catalog) -> None:
         fill(catalog, "mug", 3, 0)
         fill(catalog, "tin", 2, 10)
         catalog.image_path(catalog.object("mug").views[1].image).unlink()
         forget(catalog)
-        done = finished(derived.redescribe(catalog))
-        assert (done.described, [name for name, _ in done.failed]) == (2, ["mug"])
         with pytest.raises(CatalogError, match=r"'mug' cannot be described.*missing"):
             derived.views(catalog)
+        assert next(derived.load_views(catalog, "cedd")) == JobProgress(0, 1)  # the other one is described

@@ -210,7 +210,7 @@ url = "postgresql+psycopg://ada:w0rd@host.invalid/rig"
 def test_log_and_users_of_the_bench_hide_passwords(rig, tmp_path, monkeypatch):
     url = "postgresql://ada:w0rd@host.invalid/rig"
     with Catalog.open(tmp_path / "catalog", clock=SystemClock()) as catalog:
-        catalog.note(Action.COPIED, origin=url, digest="a1")
+        catalog.note(Action.IMPORTED, origin=url, digest="a1")
     texts = [rig("log").output, rig("log", "--json").output]
     assert all("ada:***@host.invalid" in text for text in texts)
     monkeypatch.setattr(sys, "argv", ["rig", "jog", "--set", f"catalog.url={url}"])

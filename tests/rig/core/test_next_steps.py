@@ -30,10 +30,7 @@ FOR_TERMINALS = ("rig/cli", "sim/demo", "sim/realtime")
         (("Wait, or", Do.STOP()), "Wait, or stop the table and switch its torque off: `rig stop`."),
         (Do.ENROLL(), "Enroll an object: `rig enroll NAME`."),
         (Do.ENROLL(name="a cup"), "Enroll an object: `rig enroll 'a cup'`."),
-        (
-            Do.REDESCRIBE(descriptor=None, region="1,2,3,4"),
-            "Describe the stored images again: `rig catalog redescribe --region 1,2,3,4`.",
-        ),
+        (Do.GOTO(angle=None), "Rotate the table to an angle: `rig goto ANGLE`."),
         (Do.ACKNOWLEDGE_IN_PROGRAM(reboot=True), f"{Do.ACKNOWLEDGE_IN_PROGRAM.words.capitalize()}."),
         (Do.RUN_AGAIN(on_conflict="skip"), "Start again with --on-conflict skip."),
         (Do.INSTALL_EXTRA(extra="web"), "Install the missing packages: `pip install 'hbr-rig[web]'`."),

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from rig.config.servos import known_model, model_numbers
 from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, RequestRejected, SeveralServos, UsageError
 from rig.devices.dynamixel.registers import control_table
-from rig.doctor.register_meaning import baud_codes, meaning
-from rig.doctor.single_servo import single_servo
+from rig.doctor.single_servo import baud_codes, single_servo
 from rig.safety.saved_state import Holder
 from tests.fuzzing import fuzz_settings
 from tests.rig.doctor.doctor_parts import unopened
@@ -108,47 +107,9 @@ def test_ax_12a_is_changed_by_protocol_1(monkeypatch):
             servo.set_baud(115_200)
         with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == (4, 115_200)
-            assert meaning(servo.table, "Baud Rate", servo.read()["Baud Rate"]).startswith("1176")  # 2 MBd by 17
+            assert servo.read()["Baud Rate"] == 16  # 2 MBd by 17
 
 
-# -- meaning ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("Baud Rate", 3, "1000000 bit/s"),
-        ("Return Delay Time", 250, "500 µs"),
-        ("Drive Mode", 0b1101, "reversed direction, time-based profile, torque on by goal"),
-        ("Operating Mode", 4, "extended position, many revolutions"),
-        ("Secondary ID", 255, "off"),
-        ("Homing Offset", -1024, "−90.00°"),
-        ("Min Voltage Limit", 95, "9.5 V"),
-        ("PWM Limit", 885, "100.0 %"),
-        ("Current Limit", 1193, "3209 mA"),
-        ("Shutdown", 0b110100, "overheating, electrical shock, overload"),
-        ("Hardware Error Status", 0, "none"),
-        ("Bus Watchdog", 25, "500 ms"),
-        ("Bus Watchdog", 255, "tripped"),
-        ("Profile Acceleration", 11, "236.0 °/s²"),
-        ("Profile Velocity", 0, "as fast as it can"),
-        ("Present Velocity", -66, "−90.68 °/s"),
-        ("Present Position", 4096, "360.00°"),
-        ("Present Current", -100, "−269 mA"),
-        ("Present Temperature", 33, "33 °C"),
-        ("Torque Enable", 1, "on"),
-        ("Position P Gain", 640, ""),
-    ],
-)
-def test_registers_have_the_units_of_the_e_manual(name, value, expected):
-    assert meaning(control_table("xm430_w350"), name, value) == expected
-
-
-def test_every_register_of_every_model_accepts_every_value():
+def test_every_driven_model_has_baud_rates():
     for model in (name for name in model_numbers().values() if not known_model(name).missing()):
-        table = control_table(model)
-        assert baud_codes(table)
-        for register in table.values():
-            top = 256**register.size
-            for value in (0, 1, 2, top // 2 - 1, -top // 2 if register.signed else top - 1):
-                assert isinstance(meaning(table, register.name, value), str)
+        assert baud_codes(control_table(model))

@@ -15,7 +15,7 @@ from rig.events.events import Accepted, Enrolled, Moved, Started
 from rig.motion.move import MotionTimes
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
-from rig.plans.estimate import TimeLeft, dry_run, even_azimuths, table_angles
+from rig.plans.estimate import TimeLeft, even_azimuths, table_angles
 from tests.rig.bench_parts import motion_bench
 
 LIMITS = st.floats(-2000, 0).flatmap(
@@ -62,20 +62,21 @@ def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulat
 def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_path, views):
     s = simulated(seed=3)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        (before,) = dry_run(s.bench, catalog, {"dice": None}, views=views)
-        left = TimeLeft(MotionTimes(s.bench.config), before.angles_deg)
+        model = MotionTimes(s.bench.config)
+        angles_deg = table_angles(even_azimuths(views, (-400, 400)), (-400, 400))
+        left = TimeLeft(model, angles_deg)
         predicted = []
         for event in enroll(s.bench, catalog, "dice", views=views):
             left.add(event)
             if isinstance(event, Started):
-                assert event.angles_deg == before.angles_deg
+                assert event.angles_deg == angles_deg
                 start_ns = s.bench.clock.now_ns()
             if isinstance(event, Accepted):
                 predicted.append((s.bench.clock.now_ns(), left.seconds))
     end_ns = s.bench.clock.now_ns()
     duration_s = (end_ns - start_ns) * 1e-9
     assert isinstance(event, Enrolled)
-    assert before.seconds == pytest.approx(duration_s, rel=0.1)
+    assert model.enrollment_s(0.0, angles_deg) == pytest.approx(duration_s, rel=0.1)
     for now_ns, seconds in predicted:
         assert seconds == pytest.approx((end_ns - now_ns) * 1e-9, rel=0.1, abs=1.5)
 
@@ -85,37 +86,6 @@ def test_move_is_estimated_with_the_time_in_which_the_table_must_be_quiet(quiet_
     with motion_bench(f"table.quiet_s={quiet_s}") as (bench, _), Turntable(bench) as table:
         table.goto(10.0)
         assert MotionTimes(bench.config).move_s(90.0) == pytest.approx(table.goto(100.0).seconds, abs=0.1)
-
-
-def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_path):
-    s = simulated()
-    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        list(enroll(s.bench, catalog, "dice", views=4))
-        plan = enroll(s.bench, catalog, "lamp", views=6)
-        for event in plan:
-            if isinstance(event, Accepted) and event.index == 1:
-                break
-        plan.close()
-        stands_deg = s.world.table_deg()
-
-        def actions(*names: str, **options: bool) -> list[tuple[str, str, int]]:
-            found = dry_run(s.bench, catalog, dict.fromkeys(names), views=5, **options)
-            return [(one.name, one.action, one.views) for one in found]
-
-        assert actions("dice", "lamp", "clock") == [("dice", "skip", 0), ("lamp", "resume", 4), ("clock", "enroll", 5)]
-        assert actions("dice") == [("dice", "reject", 0)]
-        assert actions("dice", replace=True) == [("dice", "replace", 5)]
-        assert actions("lamp") == [("lamp", "reject", 0)]
-        assert actions("lamp", resume=True) == [("lamp", "resume", 4)]
-        assert actions("clock", resume=True) == [("clock", "reject", 0)]
-        (resumed,) = dry_run(s.bench, catalog, {"lamp": None}, resume=True)
-        assert resumed.angles_deg == (120.0, 180.0, 240.0, 300.0)
-        assert resumed.table_deg == pytest.approx(60.0, abs=0.3)
-        assert resumed.travel_deg == pytest.approx(60 + 180 + 300, abs=1)
-        assert {o.name for o in catalog.objects()} == {"dice", "lamp"}
-    assert s.world.table_deg() == pytest.approx(stands_deg, abs=0.01)
-    found = dry_run(s.bench, None, {"new": None, "own": 6}, views=4)
-    assert [(one.action, one.views) for one in found] == [("enroll", 4), ("enroll", 6)]
 
 
 def test_downward_moves_take_longer():

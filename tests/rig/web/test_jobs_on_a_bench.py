@@ -189,9 +189,9 @@ def test_calibrations_are_offered_and_others_rejected(serve):
 def test_calibration_runs_as_a_job(serve):
     served = serve()
     job = served.run(kind="calibrate", name="servo")
-    assert [one["name"] for one in job["result"]["calibrations"]] == ["servo.backlash", "servo.encoder", "servo.motion"]
+    assert [one["name"] for one in job["result"]["calibrations"]] == ["servo.backlash", "servo.encoder"]
     history = served.client.get("/api/v1/calibrations").json()["history"]
-    assert {one["name"] for one in history} == {"servo.backlash", "servo.encoder", "servo.motion"}
+    assert {one["name"] for one in history} == {"servo.backlash", "servo.encoder"}
 
 
 def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(serve, tmp_path):

@@ -81,7 +81,7 @@ def process(*words: str, cwd: Path) -> subprocess.Popen[str]:
         [sys.executable, "-c", START, *words],
         cwd=cwd,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "500"},
-        stdin=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -101,10 +101,6 @@ def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
     try:
         assert bench.stdout is not None
         first.check("".join(bench.stdout.readline() for _ in range(3)))
-        bench.stdin.write("put\nclear\n")
-        bench.stdin.flush()
-        said = [bench.stdout.readline() for _ in range(2)]
-        assert said == ["'put' does not take 0 words. Write: put NAME [DEGREES]\n", "The table is empty.\n"]
         monkeypatch.chdir(folder)
         monkeypatch.setenv("COLUMNS", "500")
         walked = [typed for typed in rest if in_depth or typed.section not in IN_DEPTH]

@@ -338,7 +338,7 @@ def test_bench_that_ends_answers_what_was_asked(session, tmp_path):
     server = BenchServer(tmp_path, session._devices, session._time, session._bench.commands)
     client = connected(tmp_path)
     client.sendall(b'{"ask": "do", "words": ["status"]}\n')
-    server.accept()
+    server.handle_request()
     with session._time.present():  # the answer has to wait
         end = threading.Thread(target=server.server_close)
         end.start()

@@ -2,7 +2,6 @@
 
 import sqlite3
 import zipfile
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -11,15 +10,12 @@ import numpy as np
 import pytest
 
 from rig.catalog import Catalog
-from rig.catalog.copying import copy_catalog
 from rig.catalog.exchange.bundle import write_bundle
-from rig.catalog.results import find_results, record
 from rig.catalog.transfer import CatalogSource, Conflict
 from rig.catalog.verify import verify
-from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectExists
-from rig.core.next_steps import Do
+from rig.core.errors import CatalogDamaged, ExportFailed, ObjectExists
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image, new_result, sql
+from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image
 from tests.rig.catalog.exchange.exchange_samples import facts, import_bundle, model, pictures, run_import, untouched
 
 
@@ -102,53 +98,3 @@ class TestMerge:
         statuses = [[str(one.status) for one in other.object(name).enrollments] for name in ("mug-white", "tin")]
         assert statuses == [["complete", "superseded", "superseded"], ["in progress", "abandoned"]]
         assert finished(verify(other)).findings == ()
-
-
-class TestCopy:
-    def test_copy_has_every_row_and_continues(self, full: Catalog, open_catalog: OpenCatalog) -> None:
-        fill(full, "last", 1, 70)
-        full.delete("last")
-        record(full, new_result(object_name="mug-white"), image(7))
-        other = open_catalog("copy")
-        done = finished(copy_catalog(full, other))
-        assert (done.objects, done.views, done.results) == (3, 13, 1)
-        assert [line.digest for line in other.log()[:-1]] == [line.digest for line in full.log()]
-        assert other.log()[-1].action == "copied"
-        assert everything(other) == everything(full)
-        assert pictures(other) == pictures(full)
-        assert [one.answered for one in find_results(other)] == [one.answered for one in find_results(full)]
-        other.undelete("last")
-        fill(other, "next", 1, 71)
-        assert finished(verify(other)).findings == ()
-
-    def test_id_of_a_removed_enrollment_is_not_given_again(self, full: Catalog, open_catalog: OpenCatalog) -> None:
-        full.begin("last", planned_azimuth_deg=[0.0], provenance=PROVENANCE).discard()
-        other = open_catalog("copy")
-        finished(copy_catalog(full, other))
-        ids = [catalog.begin("new", planned_azimuth_deg=[0.0], provenance=PROVENANCE).id for catalog in (full, other)]
-        assert ids[0] == ids[1]
-
-    def test_only_an_empty_catalog_is_filled(self, full: Catalog, open_catalog: OpenCatalog) -> None:
-        other = open_catalog("copy")
-        fill(other, "mine", 1)
-        with pytest.raises(CatalogError, match="is not empty") as error:
-            finished(copy_catalog(full, other))
-        assert Do.MERGE() in error.value.steps
-
-    @pytest.mark.sqlite
-    @pytest.mark.parametrize(
-        "damage",
-        [
-            lambda full: sql(full, "UPDATE views SET azimuth_deg = 1.0 WHERE id = 2"),
-            lambda full: sql(full, "UPDATE log SET time_utc = '2020-01-01 00:00:00.000000' WHERE id = 2"),
-            lambda full: full.image_path(full.object("mug-white").views[0].image).unlink(),
-        ],
-    )
-    def test_damaged_catalog_is_not_copied(
-        self, full: Catalog, open_catalog: OpenCatalog, damage: Callable[[Catalog], None]
-    ) -> None:
-        damage(full)
-        other = open_catalog("copy")
-        with pytest.raises(CatalogError):
-            finished(copy_catalog(full, other))
-        assert untouched(other, images=True)

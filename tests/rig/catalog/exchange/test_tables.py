@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rig.catalog import Catalog, View
-from rig.catalog.derived import choose_region, views
+from rig.catalog.derived import views
 from rig.catalog.exchange.photographs import read_folder, read_table
 from rig.catalog.exchange.tables import TableFormat, plain_row, write_folder, write_views
 from rig.catalog.transfer import CatalogSource
@@ -116,19 +116,6 @@ def test_parquet_without_pyarrow_names_the_extra(
     with pytest.raises(ExportFailed) as error:
         write_views(tmp_path / "a.parquet", CatalogSource(full), TableFormat.PARQUET)
     assert error.value.steps == (Do.INSTALL_EXTRA(extra="parquet"),)
-
-
-def test_exports_contain_the_region_that_was_chosen_last(open_catalog: OpenCatalog, tmp_path: Path) -> None:
-    catalog = open_catalog("regions")
-    enroll(catalog, "mug", 2, 0, REGION)
-    choose_region(catalog, (0, 0, 48, 48))
-    write_folder(tmp_path / "table", CatalogSource(catalog))
-    rows = table_rows(tmp_path / "table" / "views.csv")
-    assert {row["region"] for row in rows} == {"0 0 48 48"}
-    levels = views(catalog).descriptors
-    copy = open_catalog("copy")
-    run_import(copy, read_table(tmp_path / "table" / "views.csv", now=NOW))
-    assert np.array_equal(views(copy).descriptors, levels)
 
 
 def test_export_overwrites_nothing_and_leaves_no_partial_files(sample: Path, tmp_path: Path) -> None:

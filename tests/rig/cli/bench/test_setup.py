@@ -300,7 +300,7 @@ def test_two_servos_on_the_bus_are_rejected(parts, home):
 
 def test_info_shows_every_register(parts, home):
     reported = json.loads(rig("servo", "info", "--json").stdout)
-    assert reported["registers"]["Present Input Voltage"]["meaning"] == "12.0 V"
+    assert reported["registers"]["Present Input Voltage"]["value"] == 120
     assert reported["registers"]["Operating Mode"]["kept_without_supply"] is True
     text = rig("servo", "info").stdout
     assert all(name in text for name in reported["registers"])

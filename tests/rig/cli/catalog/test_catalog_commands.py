@@ -133,17 +133,15 @@ def test_verify_names_the_object_and_sets_the_exit_code(two: Rig) -> None:
 def test_search_computes_a_new_descriptor_by_itself(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
     assert two("identify", "--strategy", "ahbr", "--set", "identify.max_views=2").exit_code in (0, 8)
-    assert result(two("catalog", "redescribe", "--json"))["unchanged"] == 8
-    assert two("catalog", "redescribe", "--descriptor", "sift").exit_code == 2
-    assert two("catalog", "redescribe", "--region", "1,2,3").exit_code == 2
 
 
 def test_identify_reports_another_region(rig: Rig) -> None:
     assert rig("enroll", "dice", "--views", "4").exit_code == 0
     moved = ("--set", "view.roi=[45, 0, 230, 240]", "--set", "bench.sim.object=dice", "--set", "identify.max_views=2")
-    assert "now it is [45, 0, 230, 240]" in rig("identify", *moved).stderr
-    assert rig("catalog", "redescribe", "--region", "45,0,230,240").exit_code == 0
-    assert "view.roi" not in rig("identify", *moved).stderr
+    note = rig("identify", *moved).stderr
+    assert "now it is [45, 0, 230, 240]" in note
+    assert "rig config set view.roi '[40, 0, 240, 240]'" in note
+    assert "view.roi" not in rig("identify", *moved[2:]).stderr
 
 
 def test_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:

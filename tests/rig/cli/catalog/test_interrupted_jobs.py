@@ -6,9 +6,6 @@ from typing import Any
 import pytest
 from click.testing import Result
 
-from hbr.descriptors import registry
-from hbr.descriptors.cedd import Cedd
-
 Rig = Callable[..., Result]
 
 
@@ -33,14 +30,3 @@ def test_interrupted_check_changes_nothing(two: Rig, monkeypatch: pytest.MonkeyP
     assert stopped.exit_code == 130
     assert "Interrupted; nothing was changed." in stopped.stderr
     assert "torque" not in stopped.stderr
-
-
-def test_interrupted_redescription_continues(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "0 views described, 8 unchanged" in two("catalog", "redescribe").stdout
-    monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
-    with monkeypatch.context() as patch:
-        interrupt(patch, "rig.catalog.derived", 1)
-        stopped = two("catalog", "redescribe")
-    assert stopped.exit_code == 130
-    assert "To continue: rig catalog redescribe --descriptor cedd" in stopped.stderr
-    assert "4 views described, 4 unchanged" in two("catalog", "redescribe").stdout

@@ -46,19 +46,6 @@ def test_training_set_is_exported_and_imported(rig, tmp_path):
     assert (imported["objects"], imported["views"], imported["rejected"]) == (1, 6, [])
 
 
-def test_dry_run_shows_the_plan_and_stores_nothing(rig):
-    before = sorted(Path("catalog").rglob("*.png"))
-    done = rig("enroll", "clock", "--views", "6", "--dry-run")
-    assert done.exit_code == 0
-    assert "clock: enroll, 6 views, about" in done.stdout
-    assert "Table angles: 0.0°, 60.0°, 120.0°, 180.0°, 240.0°, 300.0°" in done.stdout
-    assert "600° of rotation" in done.stdout
-    assert "not possible, it is already enrolled" in rig("enroll", "lamp", "--dry-run").stdout
-    (planned,) = json.loads(rig("enroll", "lamp", "--replace", "--dry-run", "--json").stdout)["dry_run"]
-    assert (planned["action"], planned["views"]) == ("replace", 6)
-    assert sorted(Path("catalog").rglob("*.png")) == before
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
