@@ -109,9 +109,12 @@ class ComputerFiles:
         mode: int = 0o660,
         serial: str | None = None,
         usb_port: str = "",
+        usb: tuple[str, str, str] = ("046d", "0825", ""),
         capabilities: int = CAPTURE,
     ) -> None:
         """Add a node of a camera, on a USB port such as 1-2; nodes with an index above 0 deliver no images.
+
+        ``usb`` are its ids and its product name.
 
         The node's text is the answer of VIDIOC_QUERYCAP.
         """
@@ -120,11 +123,11 @@ class ComputerFiles:
         self.write(f"dev/video{number}", f"{capabilities:#x}").chmod(mode)
         self.link(f"dev/v4l/by-id/usb-{name.replace(' ', '_')}-video-index{index}", self.root / f"dev/video{number}")
         if usb_port:
-            usb = f"sys/devices/{usb_port}"
-            for key, value in {"idVendor": "046d", "idProduct": "0825", "serial": serial}.items():
+            device = f"sys/devices/{usb_port}"
+            for key, value in zip(("idVendor", "idProduct", "product", "serial"), (*usb, serial), strict=True):
                 if value:
-                    self.write(f"{usb}/{key}", f"{value}\n")
-            self.link(f"sys/class/video4linux/video{number}/device", self.root / usb)
+                    self.write(f"{device}/{key}", f"{value}\n")
+            self.link(f"sys/class/video4linux/video{number}/device", self.root / device)
             self.link(f"dev/v4l/by-path/usb-{usb_port}-video-index{index}", self.root / f"dev/video{number}")
 
     def keeps_time(self, synchronised: bool = True) -> None:

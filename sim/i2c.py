@@ -1,7 +1,8 @@
 """A simulated I2C bus underneath the unmodified smbus2.
 
 smbus2 opens a path and calls `ioctl` on it; the simulator replaces the name ``smbus2.smbus2.ioctl``. While a simulated
-bus is open, calls on its file go to the bus and all others to the kernel, so a real bus works beside it.
+bus is open, calls on its file go to the bus and all others to the kernel, so a real bus works beside it. The entry of
+sysfs with the adapter's name is replaced in the same way.
 
 Transactions follow the kernel's user interface (Documentation/i2c/{dev-interface,smbus-protocol,fault-codes}.rst). Not
 simulated: ten-bit addresses, packet error checking, several masters. A device that stretches the clock (its attribute
@@ -15,11 +16,13 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from errno import EBUSY, EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import smbus2.smbus2 as smbus
 
+from rig.devices import i2c
 from sim.clock import VirtualClock
 
 BIT_NS = 2_500  # one bit at 400 kHz (fast mode); a byte takes nine, with its acknowledge
@@ -76,11 +79,11 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     """A bus with a path that ``smbus2.SMBus(path)`` opens.
 
     Tests use `attach`, `detach` (unplug), `nack`, `nack_conditions` (called with an address; True: no acknowledge),
-    `cut_read`, `stuck`, `stuck_error` (ETIMEDOUT as the adapter of a Raspberry Pi, or EIO as an i2c-tiny-usb),
-    `kernel_drivers` (addresses that a kernel driver uses), `errors` (address to the number of the
-    error at each transfer), and `wire`, the last acknowledged messages. `bit_ns` is the time of a bit. `stretch_errors`
-    is the share of reads in which the controller does not wait for a stretched clock, as that of a Raspberry Pi 4 does
-    above 20 kHz: it takes a bit too early, and all later bits are late by one.
+    `cut_read`, `stuck`, `stuck_error` (ETIMEDOUT as the adapter of a Raspberry Pi, or EIO as an i2c-tiny-usb), `name`
+    (the kernel's name of the adapter), `kernel_drivers` (addresses that a kernel driver uses), `errors` (address to the
+    number of the error at each transfer), and `wire`, the last acknowledged messages. `bit_ns` is the time of a bit.
+    `stretch_errors` is the share of reads in which the controller does not wait for a stretched clock, as that of a
+    Raspberry Pi 4 does above 20 kHz: it takes a bit too early, and all later bits are late by one.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
@@ -89,6 +92,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self._addressed: dict[int, int] = {}
         self._nacks = 0
         self._cut: int | None = None
+        self.name = ""
         self.stuck = False
         self.stuck_error = ETIMEDOUT
         self.bit_ns = BIT_NS
@@ -301,8 +305,10 @@ def _os_error(number: int) -> OSError:
 
 _FileKey = tuple[int, int]
 _seam: Any = smbus
+_sysfs: Any = i2c
 _routed: "dict[_FileKey, Adapter]" = {}
 _kernel_ioctl: Any = None
+_kernel_name = i2c.adapter_name
 
 
 class Adapter(Protocol):
@@ -319,15 +325,15 @@ class RoutedFile:
         global _kernel_ioctl
         self._fd: int | None = os.memfd_create("sim-i2c")  # without a name, so that a killed program leaves no file
         self.path = f"/dev/fd/{self._fd}"
-        self._key = _file_key(self._fd)
+        self._key = _file_key(os.fstat(self._fd))
         if not _routed:
-            _kernel_ioctl, _seam.ioctl = _seam.ioctl, _routed_ioctl
+            _kernel_ioctl, _seam.ioctl, _sysfs.adapter_name = _seam.ioctl, _routed_ioctl, _routed_name
         _routed[self._key] = adapter
 
     def close(self) -> None:
         """Remove the file; a second call does nothing."""
         if _routed.pop(self._key, None) and not _routed:
-            _seam.ioctl = _kernel_ioctl
+            _seam.ioctl, _sysfs.adapter_name = _kernel_ioctl, _kernel_name
         if self._fd is not None:
             os.close(self._fd)
             self._fd = None
@@ -338,11 +344,15 @@ def open_files() -> int:
     return len(_routed)
 
 
-def _file_key(fd: int) -> _FileKey:
-    status = os.fstat(fd)
+def _file_key(status: os.stat_result) -> _FileKey:
     return status.st_dev, status.st_ino
 
 
 def _routed_ioctl(fd: int, request: int, argument: Any = 0, *rest: Any) -> Any:
-    adapter = _routed.get(_file_key(fd))
+    adapter = _routed.get(_file_key(os.fstat(fd)))
     return adapter.ioctl(fd, request, argument) if adapter else _kernel_ioctl(fd, request, argument, *rest)
+
+
+def _routed_name(path: str) -> str:
+    adapter = _routed.get(_file_key(Path(path).stat()))
+    return getattr(adapter, "name", "") if adapter else _kernel_name(path)

@@ -1,9 +1,9 @@
-"""A fake of the Python package picamera2 in front of the simulated camera: a Raspberry Pi with a Camera Module 3.
+"""A fake of the Python package picamera2 in front of the simulated camera: a Raspberry Pi with a Camera Module 2 or 3.
 
 It has the part of picamera2's interface that `rig.devices.picamera2_capture` uses, with the behaviour that a driver can
 handle wrongly: settings take effect some frames later, only the metadata of a frame contain the settings in force, a
-name that the camera lacks is an error, there are only as many frames as released buffers, and the time stamp is that of
-the readout.
+name that the camera lacks is an error, there are only as many frames as released buffers, the time stamp is that of the
+readout, and most modes of the sensor see a part of its field only.
 """
 
 from collections import deque
@@ -32,6 +32,20 @@ _CONTROLS: Final[dict[str, tuple[Any, Any, Any]]] = {
     "LensPosition": (0.0, 15.0, 1.0),
     "Sharpness": (0.0, 16.0, 1.0),
 }
+MODES: Final[dict[str, tuple[tuple[tuple[int, int], float, tuple[int, int, int, int]], ...]]] = {
+    "imx219": (
+        ((640, 480), 103.33, (1000, 752, 1280, 960)),
+        ((1640, 1232), 41.85, (0, 0, 3280, 2464)),
+        ((1920, 1080), 47.57, (680, 692, 1920, 1080)),
+        ((3280, 2464), 21.19, (0, 0, 3280, 2464)),
+    ),
+    "imx708": (
+        ((1536, 864), 120.13, (768, 432, 3072, 1728)),
+        ((2304, 1296), 56.03, (0, 0, 4608, 2592)),
+        ((4608, 2592), 14.35, (0, 0, 4608, 2592)),
+    ),
+}
+"""Modes of a Camera Module 2 and of a 3, as picamera2 lists them: size, frames/s, and part of the sensor."""
 _FOCUS_PER_DIOPTRE: Final = 17.0  # the simulated lens has 0 to 255
 
 
@@ -40,6 +54,7 @@ class Picamera2:
 
     sensor: SimCapture
     clock: Clock
+    model = "imx708"
     in_use = False
 
     def __init__(self, camera_num: int = 0) -> None:
@@ -54,20 +69,38 @@ class Picamera2:
         self._frames = 0
         self.held = 0
         self._waiting = 0
+        self.field = 1.0
+        """Share of the sensor's width that the mode sees."""
         self.sensor.reopen()
 
-    @staticmethod
-    def global_camera_info() -> list[dict[str, Any]]:
-        return [{"Model": "imx708", "Location": 2, "Rotation": 180, "Id": "/base/axi/pcie/i2c/imx708@1a", "Num": 0}]
+    @classmethod
+    def global_camera_info(cls) -> list[dict[str, Any]]:
+        return [
+            {"Model": cls.model, "Location": 2, "Rotation": 180, "Id": f"/base/axi/pcie/i2c/{cls.model}@1a", "Num": 0}
+        ]
 
     @property
     def camera_controls(self) -> dict[str, tuple[Any, Any, Any]]:
         return dict(_CONTROLS)
 
+    @property
+    def sensor_modes(self) -> list[dict[str, Any]]:
+        assert not self._started  # it configures the camera in each mode
+        return [
+            {"format": f"SRGGB{bits}", "bit_depth": bits, "size": size, "fps": fps, "crop_limits": crop}
+            for bits in (10, 8)
+            for size, fps, crop in MODES[self.model]
+        ]
+
     def create_video_configuration(
-        self, main: dict[str, Any] | None = None, controls: dict[str, Any] | None = None, buffer_count: int = 6
+        self,
+        main: dict[str, Any] | None = None,
+        controls: dict[str, Any] | None = None,
+        buffer_count: int = 6,
+        sensor: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
         return {"main": {"format": "XBGR8888", "size": (1280, 720)} | (main or {})} | {
+            "sensor": sensor or {},
             "controls": controls or {},
             "buffer_count": buffer_count,
         }
@@ -81,6 +114,16 @@ class Picamera2:
         self._check(config["controls"])
         self.sensor.set(cv2.CAP_PROP_FRAME_WIDTH, 640 if width > 480 else 320)
         size = tuple(int(self.sensor.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        nearest = config["sensor"].get("output_size", config["main"]["size"])
+
+        def distance(mode: tuple[tuple[int, int], float, tuple[int, int, int, int]]) -> float:
+            """libcamera's measure of a mode: pixels that lack, pixels too many, and another shape."""
+            shape = (mode[0][0] / mode[0][1], nearest[0] / nearest[1])
+            pairs = (*zip(mode[0], nearest, strict=True), tuple(1500 * one for one in shape))
+            return sum(2 * (asked - has) if asked > has else (has - asked) / 4 for has, asked in pairs)
+
+        _, _, (_, _, seen, _) = min(MODES[self.model], key=distance)
+        self.field = seen / MODES[self.model][-1][0][0]
         self._config = config | {"main": config["main"] | {"size": size}}
 
     def camera_configuration(self) -> dict[str, Any]:
@@ -176,15 +219,19 @@ class CompletedRequest:
         assert name == "main"
         _, image = self._camera.sensor.retrieve()
         assert image is not None
-        return image
+        lost = [round(pixels * (1 - self._camera.field) / 2) for pixels in image.shape[:2]]
+        seen = image[lost[0] : image.shape[0] - lost[0], lost[1] : image.shape[1] - lost[1]]
+        return np.asarray(cv2.resize(seen, image.shape[1::-1]), np.uint8)
 
     def release(self) -> None:
         self._camera.held -= 1
 
 
-def module(sensor: SimCapture, clock: Clock) -> ModuleType:
-    """Return a module ``picamera2`` whose camera is ``sensor``; a test puts it into `sys.modules`."""
+def module(sensor: SimCapture, clock: Clock, model: str = "imx708") -> ModuleType:
+    """Return a module ``picamera2`` whose camera of a model is ``sensor``; a test puts it into `sys.modules`."""
     sensor.remembers = False  # libcamera reports the settings of each frame
     fake: Any = ModuleType("picamera2")
-    fake.Picamera2 = type("Picamera2", (Picamera2,), {"sensor": sensor, "clock": clock, "in_use": False})
+    fake.Picamera2 = type(
+        "Picamera2", (Picamera2,), {"sensor": sensor, "clock": clock, "model": model, "in_use": False}
+    )
     return fake  # type: ignore[no-any-return]

@@ -14,9 +14,7 @@
 #define MPU_FIFO_COUNTH 0x72
 #define MPU_FIFO_R_W 0x74
 #define MPU_WHO_AM_I 0x75
-#define MPU_ID 0x68
 #define MPU_FRAME 14   /* accelerometer, temperature, gyro: seven words */
-#define MPU_FULL 1008  /* largest count at which another frame fits into 1024 bytes, minus one frame */
 
 #define BNO_CHIP_ID 0x00
 #define BNO_ACC_DATA 0x08
@@ -99,6 +97,18 @@ static bool passed(uint32_t now, uint32_t due) {
 
 static bool is_mpu(const struct imu *imu) {
     return imu->model == IMU_MODEL_MPU6050;
+}
+
+/* The sensors with the registers of the MPU-6050: itself, MPU-6500, MPU-9250, and two clones. */
+static const uint8_t mpu_ids[] = {0x68, 0x70, 0x71, 0x72, 0x98};
+
+static bool identified(const struct imu *imu) {
+    return is_mpu(imu) ? memchr(mpu_ids, imu->who_am_i, sizeof mpu_ids) != NULL : imu->who_am_i == BNO_ID;
+}
+
+/* Return the largest count at which one more frame fits into the FIFO, which has 1024 bytes only in an MPU-6050. */
+static uint16_t mpu_full(const struct imu *imu) {
+    return ((imu->who_am_i == mpu_ids[0] ? 1024 : 512) / MPU_FRAME - 1) * MPU_FRAME;
 }
 
 /* -- transfers --------------------------------------------------------------------------------------------------- */
@@ -272,7 +282,7 @@ static void date_samples(struct imu *imu, struct counters *counters) {
     uint16_t edges = hal_imu_edges(&edge_us);
     uint8_t frames = (uint8_t)(bytes / MPU_FRAME);
     imu->phase = MPU_RUN;
-    if (bytes > MPU_FULL) {
+    if (bytes > mpu_full(imu)) {
         count(&counters->fifo_overflows);
         empty_fifo(imu);
         return;
@@ -377,7 +387,7 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
         if (ended(imu, counters, IDENTIFY)) {
             imu->who_am_i = imu->got[0];
             imu->phase = WRITE;
-            if (imu->who_am_i != (is_mpu(imu) ? MPU_ID : BNO_ID)) {
+            if (!identified(imu)) {
                 lost(imu, IMU_STATUS_WRONG_ID);
             }
         }

@@ -55,7 +55,7 @@
 #define INPUT_ESTOP_OPEN 1
 #define INPUT_RELAY_CLOSED 2
 
-/* Sensors that the head supports. */
+/* Sensors that the head supports; `mpu6050` is any sensor with its registers and a known WHO_AM_I. */
 #define IMU_MODEL_NONE 0
 #define IMU_MODEL_MPU6050 1
 #define IMU_MODEL_BNO055 2

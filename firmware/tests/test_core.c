@@ -147,12 +147,16 @@ static uint8_t ask_u8(uint8_t id, uint8_t value) {
     return ask(id, &value, 1);
 }
 
-static void power_up(void) {
+static void power_up_with(int32_t (*device)(uint64_t, int32_t, uint8_t *, int32_t)) {
     now_ns = 0;
     relay = light = trigger = 0;
-    board = board_open((struct board_outside){no_device, never}, NULL, 0, 7);
+    board = board_open((struct board_outside){device, never}, NULL, 0, 7);
     run_ms(5);
     CHECK(event[0] == MESSAGE_STATUS_CHANGED && event[FRAME_HEADER + 9] == RESET_POWER_ON);
+}
+
+static void power_up(void) {
+    power_up_with(no_device);
 }
 
 static void test_outputs_need_a_heartbeat(void) {
@@ -246,6 +250,66 @@ static void test_a_program_that_hangs_is_restarted(void) {
     board_close(board);
 }
 
+/* -- a board with a sensor whose FIFO has a fixed count --------------------------------------------------------- */
+
+static uint8_t who_am_i, registers[128], pointer;
+static bool pointed;
+
+static int32_t sensor(uint64_t ns, int32_t operation, uint8_t *data, int32_t length) {
+    (void)ns;
+    if (operation == BOARD_I2C_START_WRITE || operation == BOARD_I2C_START_READ) {
+        pointed = operation == BOARD_I2C_START_READ;
+        return data[0] == 0x68;
+    }
+    for (int32_t i = 0; i < length && operation != BOARD_I2C_STOP; i++) {
+        if (operation == BOARD_I2C_READ) {
+            data[i] = pointer == 0x75 ? who_am_i : registers[pointer];
+        } else if (pointed) {
+            registers[pointer] = data[i];
+        } else {
+            pointer = data[i] & 0x7F;
+            pointed = true;
+            continue;
+        }
+        pointer = (pointer + 1) & 0x7F;
+    }
+    return length;
+}
+
+/* Run a sensor whose FIFO always has `fifo` bytes; returns its status, and the number of overflows in `*overflows`. */
+static uint8_t run_sensor(uint8_t identity, uint16_t fifo, uint16_t *overflows) {
+    static const uint8_t setup[SIZE_SET_IMU] = {IMU_MODEL_MPU6050, 0x68, 4, 3, 0};
+    memset(registers, 0, sizeof registers);
+    who_am_i = identity;
+    registers[0x72] = (uint8_t)(fifo >> 8);
+    registers[0x73] = (uint8_t)fifo;
+    power_up_with(sensor);
+    CHECK(ask(MESSAGE_SET_IMU, setup, sizeof setup) == REJECTION_NONE);
+    run_ms(200);
+    beat(2000);
+    uint8_t status = answer[FRAME_HEADER + 11];
+    ask(MESSAGE_READ_COUNTERS, "", 0);
+    *overflows = (uint16_t)(answer[FRAME_HEADER + 16] | answer[FRAME_HEADER + 17] << 8);
+    board_close(board);
+    return status;
+}
+
+static void test_sensors_of_the_family_have_their_own_fifo(void) {
+    static const uint8_t family[] = {0x68, 0x70, 0x71, 0x72, 0x98};
+    uint16_t overflows;
+    for (unsigned id = 0; id < 256; id++) {
+        bool known = memchr(family, (int)id, sizeof family) != NULL;
+        CHECK(run_sensor((uint8_t)id, 490, &overflows) == (known ? IMU_STATUS_RUNNING : IMU_STATUS_WRONG_ID));
+        CHECK(overflows == 0 && (registers[0x6B] != 0) == known); /* nothing is written to an unknown chip */
+    }
+    for (unsigned i = 0; i < sizeof family; i++) {
+        run_sensor(family[i], 504, &overflows);
+        CHECK((overflows != 0) == (i != 0));
+        run_sensor(family[i], 1022, &overflows);
+        CHECK(overflows != 0);
+    }
+}
+
 int main(void) {
     test_crc_is_ccitt_false();
     test_every_frame_comes_back();
@@ -256,5 +320,6 @@ int main(void) {
     test_a_repeated_request_is_answered_but_not_done_twice();
     test_unknown_and_malformed_requests_are_rejected();
     test_a_program_that_hangs_is_restarted();
+    test_sensors_of_the_family_have_their_own_fifo();
     printf("%u checks passed\n", checks);
 }

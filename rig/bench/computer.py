@@ -242,6 +242,8 @@ class Computer:
         kind = (
             f"USB {usb['idVendor']}:{usb.get('idProduct', '')}" if usb else self._text(f"{_CAMERAS}/{file.name}/name")
         )
+        if usb.get("product"):  # some products of one manufacturer have the same number
+            kind += f" ({usb['product']})"
         if usb.get("serial"):
             return f"{kind}, serial number {usb['serial']}"
         place = self._link("dev/v4l/by-path", file)

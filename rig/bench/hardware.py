@@ -126,7 +126,7 @@ def assemble(
         findings = servo.prepare(write=config.servo.write_settings)
         findings += tuple(f"servo: {one}" for one in servo.remarks)
         _check_reach(config, servo)
-        if head is None and (note := imu_kind(config.imu.model).note):
+        if note := imu_kind(config.imu.model).note:
             findings += (f"imu: {note}",)
 
         # IMU and camera are opened at their first use, unless the head is the IMU.

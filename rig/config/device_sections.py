@@ -124,7 +124,10 @@ class CameraConfig(Section):
         "8333 at 60 Hz",
     )
     gain: float | None = Field(
-        0.0, ge=0, le=1e6, description="locked gain in the camera's unit; none keeps the camera's own"
+        0.0,
+        ge=0,
+        le=1e6,
+        description="locked gain in the camera's unit, at least its smallest; none keeps the camera's own",
     )
     white_balance_k: float | None = Field(
         5000.0, ge=1000, le=20000, description="locked white balance; none keeps the camera's own"

@@ -146,6 +146,10 @@ class FirmwareMismatch(DeviceMismatch, code=420, title="firmware mismatch"):
     """The rig head's firmware and this program use different versions of the protocol."""
 
 
+class ControllerHangs(DeviceSilent, code=422, title="I2C controller hangs"):
+    """The computer's I2C controller ends no transfer, also after the bus was opened again."""
+
+
 class DeviceUnplugged(DeviceSilent, code=421, title="unplugged"):
     """The port of a device disappeared from the computer."""
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import DeviceFault, DeviceSilent
+from rig.core.errors import ControllerHangs, DeviceFault, DeviceSilent
 from rig.devices.i2c import I2cRegisters, I2cStatistics
 from rig.devices.imu import ImuIdentity, ImuSamples, identified
 
@@ -141,6 +141,8 @@ class Bno055:
             try:
                 got = self._registers.read(KIND.register, 1)[0]
                 break
+            except ControllerHangs:
+                raise
             except DeviceSilent as silent:
                 if self._clock.now_ns() > deadline_ns:
                     raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent

@@ -1,6 +1,6 @@
 """Registers of a sensor on an I2C bus of the computer, through smbus2, with retries and explained errors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from errno import EAGAIN, EBUSY, EIO, ENODEV, ENXIO, EREMOTEIO, ETIMEDOUT
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import TypeVar
 from smbus2 import SMBus, i2c_msg
 
 from rig.core.clock import Clock
-from rig.core.errors import DeviceNotFound, DeviceSilent
+from rig.core.errors import ControllerHangs, DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do
 
 ATTEMPTS, RETRY_PAUSE_S = 3, 0.002
@@ -18,6 +18,13 @@ NO_DEVICE = (ENXIO, EREMOTEIO, ENODEV)
 """Errors by which the kernel's bus drivers report that no device acknowledges an address."""
 STUCK = (ETIMEDOUT, EAGAIN)
 
+DESIGNWARE = "Synopsys DesignWare I2C adapter"
+"""The kernel's name of an adapter whose controller can hang until its supply is off, as in a Raspberry Pi 5."""
+RESTART_CONTROLLER = (
+    "Switch the computer and the sensors off for 10 seconds: a restart is not always enough. If the controller hangs "
+    "again, shorten the cable, update the kernel (`sudo apt full-upgrade`), and use a slow bus (add "
+    "dtparam=i2c_arm_baudrate=50000 to /boot/firmware/config.txt, then restart)."
+)
 _SMBUS_BLOCK = 32  # I2C_SMBUS_BLOCK_MAX: longer reads need I2C_RDWR, which not every adapter has
 _REASONS = {
     **dict.fromkeys(NO_DEVICE, "it does not acknowledge"),
@@ -73,8 +80,15 @@ class I2cRegisters:
         """Return the result of ``transfer``; repeat it if the bus fails.
 
         Raises `DeviceNotFound`: a kernel driver uses the address. `DeviceSilent`: every attempt failed.
+        `ControllerHangs`: they failed as those of a hanging controller, also after the bus was opened again.
         """
-        for attempt in range(ATTEMPTS):
+        failures: list[int] = []
+        for attempt in range(ATTEMPTS + 1):
+            if attempt == ATTEMPTS:
+                if not controller_hangs(self.name, failures):
+                    break
+                self._bus.close()
+                self._bus = _open(self.name)
             if attempt:
                 self.statistics.retries += 1
                 self._clock.sleep(RETRY_PAUSE_S)
@@ -83,8 +97,17 @@ class I2cRegisters:
                 return transfer()
             except OSError as error:
                 failure = error
+                failures.append(error.errno or 0)
                 if error.errno == EBUSY:
                     raise self._in_use() from error
+        evidence = {"errno": failure.errno, "attempts": len(failures), "retries_so_far": self.statistics.retries}
+        if controller_hangs(self.name, failures):
+            raise ControllerHangs(
+                f"The I2C controller of {self.name} hangs ({DESIGNWARE}, as in a Raspberry Pi 5): no transfer with the "
+                f"sensor at {self.address:#04x} ends, also after the bus was opened again.",
+                next_step=RESTART_CONTROLLER,
+                evidence=evidence,
+            ) from failure
         reason = _REASONS.get(failure.errno or 0, failure.strerror)
         raise DeviceSilent(
             f"The sensor at I2C address {self.address:#04x} of {self.name} stopped answering: {reason}.",
@@ -92,7 +115,7 @@ class I2cRegisters:
             "Then open the bench again."
             if failure.errno in STUCK
             else "Check its plug and supply, then open the bench again.",
-            evidence={"errno": failure.errno, "attempts": ATTEMPTS, "retries_so_far": self.statistics.retries},
+            evidence=evidence,
         ) from failure
 
     def _in_use(self) -> DeviceNotFound:
@@ -116,6 +139,23 @@ class I2cRegisters:
             "kernel driver uses the address).",
             evidence=silent.evidence,
         )
+
+
+def controller_hangs(path: str, failures: Iterable[int]) -> bool:
+    """Return whether the errors of consecutive transfers are those of a controller that hangs.
+
+    A missing sensor is not acknowledged each time, and other adapters free the bus.
+    """
+    failed = set(failures)
+    return ETIMEDOUT in failed <= {*STUCK, EREMOTEIO} and adapter_name(path) == DESIGNWARE
+
+
+def adapter_name(path: str) -> str:
+    """Return the kernel's name of the adapter at a device file; empty if sysfs has none."""
+    try:
+        return Path("/sys/class/i2c-dev", Path(path).resolve().name, "name").read_text(encoding="utf-8").strip()
+    except OSError:
+        return ""
 
 
 def kernel_driver(bus: str, address: int, root: Path = Path("/")) -> str | None:

@@ -112,17 +112,22 @@ def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_r
     Raises `DeviceMismatch`: it is another sensor than ``kind``.
     """
     if got not in kind.identities:
-        other = recognised(address, kind.register, got)
-        expected = " or ".join(f"{identity:#04x}" for identity in kind.identities)
-        raise DeviceMismatch(
-            f"The identity register {kind.register:#04x} at I2C address {address:#04x} of {bus} is {got:#04x}, "
-            f"expected {expected} ({kind.name}): probably {likely_device(kind, address, got)}.",
-            next_step=Do.SET_KEY(key="imu.model", value=other.key)
-            if other is not None and other.driver
-            else "Check the wiring, or give the address and model of the sensor (imu.address, imu.model).",
-            evidence={"got": got, "expected": kind.identities[0]},
-        )
+        raise another_sensor(kind, got, address, bus)
     return ImuIdentity(kind.name, address, got, gyro_noise_dps_rthz)
+
+
+def another_sensor(kind: ImuKind, got: int, address: int, bus: str) -> DeviceMismatch:
+    """Return the error for a sensor that is not of ``kind``; its identity register has the value ``got``."""
+    other = recognised(address, kind.register, got)
+    expected = " or ".join(f"{identity:#04x}" for identity in kind.identities)
+    return DeviceMismatch(
+        f"The identity register {kind.register:#04x} at I2C address {address:#04x} of {bus} is {got:#04x}, "
+        f"expected {expected} ({kind.name}): probably {likely_device(kind, address, got)}.",
+        next_step=Do.SET_KEY(key="imu.model", value=other.key)
+        if other is not None and other.driver
+        else "Check the wiring, or give the address and model of the sensor (imu.address, imu.model).",
+        evidence={"got": got, "expected": kind.identities[0]},
+    )
 
 
 def open_imu(config: ImuConfig, bus: int | str, clock: Clock) -> Imu:

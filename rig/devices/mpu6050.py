@@ -5,16 +5,17 @@ MPU-9250: RM-MPU-9250A and PS-MPU-9250A. The sensor takes the gyro's samples by 
 FIFO, so a late reader loses no rotation.
 """
 
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.config.imus import ImuKind, imu_kind
 from rig.core.clock import Clock
-from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent
+from rig.core.errors import ConfigError, ControllerHangs, DeviceFault, DeviceMismatch, DeviceSilent
 from rig.devices.i2c import I2cRegisters, I2cStatistics
-from rig.devices.imu import FifoTimes, ImuIdentity, ImuSamples, identified
+from rig.devices.imu import FifoTimes, Imu, ImuIdentity, ImuSamples, identified
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
 _GYRO_CONFIG, _GYRO_SELF_TEST = 0x1B, 0xE0  # all three axes, at 250 °/s
@@ -28,9 +29,8 @@ _RESET_S, _START_S = 0.1, 0.05
 _BYTE_NS = 35_000  # a byte at 400 kHz with its acknowledge takes 22.5 µs
 _FRAME = 6  # bytes of a sample in the FIFO: three words
 
-NOISE_DPS_RTHZ = 0.005  # PS-MPU-6000A, 6.1; LSB by the full scale
 LSB_PER_G = 16384.0
-LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
+LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}  # by the full scale
 _FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}
 """DLPF_CFG by the gyro's bandwidth in Hz; all run at an internal rate of 1 kHz."""
 
@@ -63,7 +63,7 @@ class Mpu6050:
 
     KIND: ClassVar[ImuKind] = imu_kind("mpu6050")
     FIFO_BYTES: ClassVar[int] = 1024
-    NOISE_DPS_RTHZ: ClassVar[float] = NOISE_DPS_RTHZ
+    NOISE_DPS_RTHZ: ClassVar[float] = 0.005  # PS-MPU-6000A, 6.1
     TEMPERATURE: ClassVar[tuple[float, float]] = 340.0, 36.53
     """LSB per °C, and the temperature at 0 LSB, °C."""
 
@@ -149,6 +149,8 @@ class Mpu6050:
     def _identify(self) -> ImuIdentity:
         try:
             got = self._registers.read(self.KIND.register, 1)[0]
+        except ControllerHangs:
+            raise
         except DeviceSilent as silent:
             raise self._registers.not_found(silent, "AD0 pin (low 0x68, high 0x69)") from silent
         return identified(self.KIND, got, self._address, self._registers.name, self.NOISE_DPS_RTHZ)
@@ -253,34 +255,7 @@ class Mpu6050Clone(Mpu6050):
 
     def _set_up(self) -> None:
         super()._set_up()
-        # Its samples and gravity at rest.
-        due = min(float(_TESTED_SAMPLES), _TESTED_S * self.rate_hz)
-        self._clock.sleep(due / self.rate_hz)
-        samples, gravity_g = self.read_samples(), float(np.linalg.norm(self.read_gravity_g()))
-        got, rates = len(samples.time_ns), samples.gyro_dps
-        noise_dps = float(rates.std(axis=0).max()) if got else 0.0
-        problems = []
-        if samples.lost or abs(got - due) > 0.1 * due + 2:
-            problems.append(f"it took {got} samples instead of {due:.0f}")
-        elif noise_dps == 0.0:
-            problems.append("all its samples are equal")
-        elif noise_dps > _WILD_DPS:
-            problems.append(f"its rates scatter by {noise_dps:.0f} °/s")
-        if not 0.8 < gravity_g < 1.2:
-            problems.append(f"gravity is {gravity_g:.2f} g")
-        # Its self-test, only if the samples can be trusted.
-        response_dps = np.zeros(3) if problems else self._self_test(rates.mean(axis=0))
-        low_dps, high_dps = _SELF_TEST_DPS
-        if not problems and not all(low_dps <= abs(one) <= high_dps for one in response_dps):
-            shown = ", ".join(f"{one:.0f}" for one in response_dps)
-            problems.append(f"its gyro responds with {shown} °/s to its self-test")
-        if problems:
-            raise DeviceMismatch(
-                f"The clone at I2C address {self._address:#04x} of {self._registers.name} does not behave as an "
-                f"MPU-6050: {'; '.join(problems)}.",
-                next_step="Keep the table still and open the bench again. If it fails again, use another sensor.",
-                evidence={"samples": got, "expected": due, "noise_dps": noise_dps, "gravity_g": gravity_g},
-            )
+        check_clone(self, self._clock, f"of {self._registers.name}", self._self_test)
 
     def _self_test(self, at_rest_dps: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the change of each axis of the gyro during its self-test, (3,), in °/s."""
@@ -294,6 +269,44 @@ class Mpu6050Clone(Mpu6050):
         self._empty_fifo()
         late = np.frombuffer(words, ">i2").reshape(-1, 3)[count // 2 :]  # after the low-pass has settled
         return late.mean(axis=0) / LSB_PER_DPS[250] - at_rest_dps if len(late) else np.zeros(3)
+
+
+def check_clone(
+    imu: Imu, clock: Clock, place: str, self_test: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+) -> None:
+    """Test the samples of a clone at rest, gravity, and with ``self_test`` its response; see `Mpu6050Clone`."""
+    due = min(float(_TESTED_SAMPLES), _TESTED_S * imu.rate_hz)
+    imu.read_samples()
+    clock.sleep(due / imu.rate_hz)
+    samples, gravity_g = imu.read_samples(), float(np.linalg.norm(imu.read_gravity_g()))
+    got, rates = len(samples.time_ns), samples.gyro_dps
+    noise_dps = float(rates.std(axis=0).max()) if got else 0.0
+    problems = []
+    if samples.lost or abs(got - due) > 0.1 * due + 2:
+        problems.append(f"it took {got} samples instead of {due:.0f}")
+    elif noise_dps == 0.0:
+        problems.append("all its samples are equal")
+    elif noise_dps > _WILD_DPS:
+        problems.append(f"its rates scatter by {noise_dps:.0f} °/s")
+    if not 0.8 < gravity_g < 1.2:
+        problems.append(f"gravity is {gravity_g:.2f} g")
+    # Its self-test, only if the samples can be trusted.
+    if self_test is not None and not problems:
+        response_dps, (low_dps, high_dps) = self_test(rates.mean(axis=0)), _SELF_TEST_DPS
+        if not all(low_dps <= abs(one) <= high_dps for one in response_dps):
+            shown = ", ".join(f"{one:.0f}" for one in response_dps)
+            problems.append(f"its gyro responds with {shown} °/s to its self-test")
+    if problems:
+        raise DeviceMismatch(
+            f"The clone at I2C address {imu.identity.bus_address:#04x} {place} does not behave as an MPU-6050: "
+            f"{'; '.join(problems)}.",
+            next_step="Keep the table still and open the bench again. If it fails again, use another sensor.",
+            evidence={"samples": got, "expected": due, "noise_dps": noise_dps, "gravity_g": gravity_g},
+        )
+
+
+DRIVERS: Final = {driver.KIND.key: driver for driver in (Mpu6050, Mpu6500, Mpu9250, Mpu6050Clone)}
+"""The drivers of this module by `ImuKind.key`; a rig head has the scales of theirs."""
 
 
 def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:

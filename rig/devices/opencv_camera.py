@@ -25,7 +25,7 @@ from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices import v4l2
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
-from rig.devices.opencv_capture import Capture, modes_of, waiter_of
+from rig.devices.opencv_capture import Capture, limits_of, modes_of, waiter_of
 from rig.devices.v4l2 import choose_mode
 
 V4L2_EXPOSURE_MANUAL = 1  # V4L2_EXPOSURE_MANUAL of linux/v4l2-controls.h
@@ -47,6 +47,8 @@ _EXPOSURE_CHANGE_FRAMES = 4  # a sensor applies a new exposure time up to this n
 _FOCUS_STILL_S, _FOCUS_LIMIT_S = 1.0, 8.0
 _FOCUS_CHANGE = 0.1  # share of the sharpness that changes while the lens moves
 
+NO_CONTROL: Final = "no such control"
+"""What a camera reports for a setting that it lacks, as the text of a `RejectedSetting`."""
 _LOCKS: Final[dict[str, tuple[int, Callable[[float], Any]]]] = {
     "exposure_us": (cv2.CAP_PROP_EXPOSURE, lambda value: value * _EXPOSURE_UNIT_US),
     "gain": (cv2.CAP_PROP_GAIN, float),
@@ -204,14 +206,20 @@ class OpenCvCamera:
 
     def _configure(self, settings: CameraConfig) -> tuple[RejectedSetting, ...]:
         """Request all settings; UVC requires that an automatic is switched off before its value is set."""
-        asked: list[tuple[str, int, float]] = []
+        asked: list[tuple[str, int, float, float]] = []
 
         def ask(name: str, prop: int, value: float | None) -> None:
-            absent = value == 0 and self._known(prop) is None  # 0 also describes a camera that lacks the control
-            if value is not None and not absent:
-                asked.append((name, prop, value))
-                if self._capture.set(prop, value):
-                    self._supported.add(prop)
+            # 0 also describes a camera that lacks the control, and a camera without this automatic has none to end.
+            if value is None or (value == 0 and self._known(prop) is None):
+                return
+            if prop == cv2.CAP_PROP_AUTO_EXPOSURE and self._lacks(prop):
+                return
+            smallest, step = limits_of(self._capture, prop)
+            if prop == cv2.CAP_PROP_GAIN:
+                value = max(value, smallest)
+            asked.append((name, prop, value, max(step / 2, 0 if name == "fourcc" else 0.01 * abs(value))))
+            if self._capture.set(prop, value):
+                self._supported.add(prop)
 
         if (fourcc := self._pixel_format(settings)) is not None:  # before the size: it selects the sizes
             ask("fourcc", cv2.CAP_PROP_FOURCC, v4l2.fourcc_number(fourcc))
@@ -232,12 +240,18 @@ class OpenCvCamera:
         if settings.focus is not None:
             ask("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0)
         ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
-        read_back = [(name, prop, value, self._capture.get(prop)) for name, prop, value in asked]
+        read_back = [(*one, self._capture.get(one[1])) for one in asked]
         return tuple(
-            RejectedSetting(name, _value_text(name, value), _value_text(name, reported))
-            for name, prop, value, reported in read_back
-            if prop not in self._supported or abs(reported - value) > (0.01 * abs(value) if name != "fourcc" else 0)
+            RejectedSetting(
+                name, _value_text(name, value), NO_CONTROL if self._lacks(prop) else _value_text(name, reported)
+            )
+            for name, prop, value, tolerance, reported in read_back
+            if prop not in self._supported or abs(reported - value) > tolerance
         )
+
+    def _lacks(self, prop: int) -> bool:
+        """Return whether the camera says that it lacks a control."""
+        return self._missing < 0 and self._capture.get(prop) == self._missing
 
     def _pixel_format(self, settings: CameraConfig) -> str | None:
         """Return the pixel format to request; None leaves it to the camera."""

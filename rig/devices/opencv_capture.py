@@ -6,7 +6,7 @@ import stat
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import cv2
 
@@ -26,6 +26,17 @@ class Capture(Protocol):
     def get(self, propId: int, /) -> float: ...
     def set(self, propId: int, value: float, /) -> bool: ...
     def release(self) -> None: ...
+
+
+_CONTROLS: Final = {  # linux/v4l2-controls.h
+    cv2.CAP_PROP_GAIN: 0x0098_0913,
+    cv2.CAP_PROP_WB_TEMPERATURE: 0x0098_091A,
+    cv2.CAP_PROP_SHARPNESS: 0x0098_091B,
+    cv2.CAP_PROP_BACKLIGHT: 0x0098_091C,
+    cv2.CAP_PROP_EXPOSURE: 0x009A_0902,
+    cv2.CAP_PROP_FOCUS: 0x009A_090A,
+}
+"""Numbers of the controls whose values are a range."""
 
 
 class V4l2Capture:
@@ -51,6 +62,10 @@ class V4l2Capture:
         """Return the modes that the camera offers."""
         return v4l2.modes(self._path)
 
+    def limits(self, propId: int) -> tuple[float, float] | None:
+        """Return the smallest value and the step of a setting; None if the camera does not tell."""
+        return v4l2.control_limits(self._path, _CONTROLS[propId]) if propId in _CONTROLS else None
+
     def set(self, propId: int, value: float, /) -> bool:
         if propId < v4l2.FIRST_CONTROL:
             return self._capture.set(propId, value)
@@ -61,6 +76,12 @@ def modes_of(capture: Capture) -> tuple[v4l2.VideoMode, ...]:
     """Return the modes that a source offers; empty for a file or a stream."""
     modes: tuple[v4l2.VideoMode, ...] = capture.modes() if hasattr(capture, "modes") else ()
     return modes
+
+
+def limits_of(capture: Capture, prop: int) -> tuple[float, float]:
+    """Return the smallest value and the step of a setting; 0 and 0 if the source does not tell."""
+    limits: tuple[float, float] | None = capture.limits(prop) if hasattr(capture, "limits") else None
+    return limits or (0.0, 0.0)
 
 
 def waiter_of(capture: Capture) -> Callable[[float], bool] | None:

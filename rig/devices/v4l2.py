@@ -24,8 +24,9 @@ _SIZE = struct.Struct("I4sI6I2I")  # index, pixel format, type, then width and h
 _INTERVAL = struct.Struct("I4sIII6I2I")  # index, pixel format, width, height, type, fractions of a second; reserved
 _VIDEO_CAPTURE, _DISCRETE = 1, 1
 _MOST_ENTRIES = 64  # a driver that never answers EINVAL must not hold the program
-_G_CTRL, _S_CTRL = 0xC008_561B, 0xC008_561C
+_G_CTRL, _S_CTRL, _QUERYCTRL = 0xC008_561B, 0xC008_561C, 0xC044_5624
 _CONTROL = struct.Struct("Ii")
+_QUERY = struct.Struct("II32s4i3I")  # number, type, name; smallest, largest, step, default; flags, reserved
 _CAPABILITY = struct.Struct("16s32s32s6I")  # driver, card, bus; version, capabilities of the driver and of this node
 
 
@@ -64,7 +65,7 @@ COMPRESSED = ("MJPG", "JPEG")
 def modes(path: Path) -> tuple[VideoMode, ...]:
     """Return the modes with pixel formats that OpenCV converts; empty if the device does not list them.
 
-    A size that is a range (stepwise) counts as its largest one.
+    A size that is a range (stepwise) counts as its largest one. Some cameras list a size twice.
     """
     found = []
     for fourcc in _entries(path, _ENUM_FMT, lambda i: _FORMAT.pack(i, _VIDEO_CAPTURE, 0, b"", b"", 0, 0, 0, 0)):
@@ -83,7 +84,7 @@ def modes(path: Path) -> tuple[VideoMode, ...]:
                 )
             ]
             found.append(VideoMode(code.decode(), width, height, max(rates, default=0.0)))
-    return tuple(found)
+    return tuple(dict.fromkeys(found))
 
 
 def choose_mode(
@@ -125,6 +126,15 @@ def get_control(path: Path, control: int) -> int | None:
     """Return the value of a control; None if the device lacks it."""
     answer = _ask(path, _G_CTRL, _CONTROL.pack(control, 0))
     return None if answer is None else int(_CONTROL.unpack(answer)[1])
+
+
+def control_limits(path: Path, control: int) -> tuple[int, int] | None:
+    """Return the smallest value and the step of a control; None if the device lacks it."""
+    answer = _ask(path, _QUERYCTRL, _QUERY.pack(control, 0, b"", *(0,) * 7))
+    if answer is None:
+        return None
+    smallest, _, step = _QUERY.unpack(answer)[3:6]
+    return int(smallest), int(step)
 
 
 def set_control(path: Path, control: int, value: int) -> bool:

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from errno import EBUSY
 
 import serial
@@ -17,7 +17,7 @@ from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import model_of, model_row, obstacle
-from rig.devices.i2c import NO_DEVICE, STUCK, unbind_command
+from rig.devices.i2c import NO_DEVICE, RESTART_CONTROLLER, STUCK, controller_hangs, unbind_command
 from rig.doctor.finding import Finding, FindingCode, bad
 
 # a scan of all takes long, so the usual ones come first
@@ -239,7 +239,8 @@ class FoundImu:
     """A device at an IMU address; ``driver``, the ``imu.model``, is None if there is no driver, or if it is unknown.
 
     ``note`` has more about it: the note of its row, or registers of an unknown chip. ``kernel_driver`` names the driver
-    that uses the address, "" if its name is not known. ``errno`` is the error of the bus at the address.
+    that uses the address, "" if its name is not known. ``errno`` is the error of the bus at the address; the controller
+    ``hangs`` if this is the only answer of the whole bus.
     """
 
     bus: str
@@ -249,6 +250,7 @@ class FoundImu:
     note: str = ""
     kernel_driver: str | None = None
     errno: int = 0
+    hangs: bool = False
 
     def __str__(self) -> str:
         return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.note}" if self.note else "")
@@ -265,6 +267,8 @@ def unusable_address(found: FoundImu) -> Finding | None:
         return None
     fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
     code = FindingCode.I2C_STUCK if found.errno in STUCK else FindingCode.I2C_FAILED
+    if found.hangs:
+        code, fix = FindingCode.I2C_HANGS, RESTART_CONTROLLER
     reason = os.strerror(found.errno)
     return bad("imu", code, fix, bus=found.bus, address=found.address, reason=reason, errno=found.errno)
 
@@ -283,8 +287,8 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
     """
     name = computer.i2c_name(bus)
     rows = imu_kinds().values()
-    found = []
-    with SMBus(computer.i2c_path(bus)) as wire:
+    found, failures, path = [], [], computer.i2c_path(bus)
+    with SMBus(path) as wire:
         for address in sorted({address for row in rows for address in row.addresses}):
             said: dict[int, int] = {}
             try:
@@ -292,6 +296,7 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
                     said[register] = wire.read_byte_data(address, register)
             except OSError as error:
                 number = error.errno or 0
+                failures.append(number)
                 if number == EBUSY:
                     driver = computer.i2c_driver(bus, address) or ""
                     found.append(FoundImu(name, address, "unknown device", None, kernel_driver=driver))
@@ -306,4 +311,5 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
             else:
                 values = ", ".join(f"register {register:#04x} is {value:#04x}" for register, value in said.items())
                 found.append(FoundImu(name, address, "unknown chip", None, values))
-    return found
+    hangs = all(one.errno for one in found) and controller_hangs(path, failures)
+    return [replace(one, hangs=hangs) for one in found]

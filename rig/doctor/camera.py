@@ -13,7 +13,7 @@ from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.camera import CameraLocks
-from rig.devices.opencv_camera import OpenCvCamera
+from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.v4l2 import choose_mode
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
@@ -96,10 +96,16 @@ def open_camera(context: DoctorContext, *, refocus: bool = False) -> OpenCvCamer
 def _mode(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     wanted = context.config.camera
     nearest = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps, wanted.fourcc)
+    size = f"{wanted.width}x{wanted.height} at {wanted.fps:.3g} frames/s"
     if nearest is None:
+        usable = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps)
+        if usable is not None:
+            fix: SomeSteps = Do.SET_KEY(key="camera.fourcc", value="none")
+            yield warning(
+                "camera", FindingCode.MODE_NOT_OFFERED, fix, wanted=f"{size} ({wanted.fourcc})", nearest=usable
+            )
         return
     if (nearest.width, nearest.height) != (wanted.width, wanted.height) or 0 < nearest.fps < 0.9 * wanted.fps:
-        size = f"{wanted.width}x{wanted.height} at {wanted.fps:.3g} frames/s"
         yield warning("camera", FindingCode.MODE_NOT_OFFERED, Do.SETUP(), wanted=size, nearest=nearest)
 
 
@@ -108,16 +114,20 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     fix = f"v4l2-ctl --list-ctrls-menus -d {context.config.camera.source}"
     for one in source.rejected_settings:
         found = {"setting": one.setting, "requested": one.asked, "reported": one.reported}
-        yield warning("camera", FindingCode.SETTING_REJECTED, fix, **found)
+        steps: SomeSteps = fix
+        if one.reported == NO_CONTROL:
+            key = "exposure_us" if one.setting == "exposure_100us" else one.setting
+            steps = (
+                "Views of one object differ if the light changes: keep it constant, or use a camera with this control.",
+                Do.SET_KEY(key=f"camera.{key}", value="none"),
+            )
+        yield warning("camera", FindingCode.SETTING_REJECTED, steps, **found)
     wanted = context.config.camera
     not_locked = [
         name
         for name, loose in (
-            ("exposure", locks.auto_exposure or (locks.exposure_us is None and wanted.exposure_us is not None)),
-            (
-                "white balance",
-                locks.auto_white_balance or (locks.white_balance_k is None and wanted.white_balance_k is not None),
-            ),
+            ("exposure", locks.auto_exposure),
+            ("white balance", locks.auto_white_balance),
             ("gain", locks.gain is not None and wanted.gain is None),
             ("focus", locks.autofocus),
             ("frame rate", locks.dynamic_frame_rate),

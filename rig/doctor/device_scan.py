@@ -11,6 +11,7 @@ import serial
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.config import CameraConfig
+from rig.config.imus import imu_kind, recognised
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.core.next_steps import Do, SomeSteps
@@ -72,7 +73,8 @@ class DeviceScan:
     cameras: list[FoundCamera] = field(default_factory=list)
     ribbons: list[int] = field(default_factory=list)
     """Numbers of the cameras on ribbon cables."""
-    heads: list[SerialPort] = field(default_factory=list)
+    heads: list[tuple[SerialPort, str]] = field(default_factory=list)
+    """Ports of rig heads, with the `imu.model` of their sensors."""
     duplicate_ids: bool = False
     """Two servos with the same id were found."""
 
@@ -114,9 +116,13 @@ class DeviceScan:
         heads = [
             DeviceCandidate(
                 f"on the rig head at {port.path}",
-                {("imu", "connection"): "head", ("head", "port"): port.stable or port.path},
+                {
+                    ("imu", "connection"): "head",
+                    ("imu", "model"): model,
+                    ("head", "port"): port.stable or port.path,
+                },
             )
-            for port in self.heads
+            for port, model in self.heads
         ]
         cameras = [
             DeviceCandidate(f"{c.node.path}: {c.node.name}, {c.width}x{c.height}", camera_settings(c))
@@ -185,9 +191,13 @@ class DeviceScan:
             yield from self._found(port, scan)
         return any(scan.answered for scan in answered)
 
-    def _head(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
+    def _head(
+        self, context: DoctorContext, port: SerialPort, model: str | None = None
+    ) -> Generator[Finding | str, None, bool]:
         yield f"{port.path}: searching for a rig head ..."
-        config = context.config.model_copy(update={"head": context.config.head.model_copy(update={"port": port.path})})
+        imu = context.config.imu.model_copy(update={"model": model or context.config.imu.model})
+        head_config = context.config.head.model_copy(update={"port": port.path})
+        config = context.config.model_copy(update={"head": head_config, "imu": imu})
         try:
             with closing(
                 open_head(config, lambda: context.computer.open_serial(port.path, BAUD), context.computer.clock)
@@ -196,9 +206,12 @@ class DeviceScan:
         except DeviceNotFound:
             return False
         except RigError as error:  # a rig head with an error
+            other = recognised(imu.address, imu_kind(imu.model).register, error.evidence.get("got", -1))
+            if model is None and other is not None and other.driver:
+                return (yield from self._head(context, port, other.key))
             yield of_error("imu", error)
             return True
-        self.heads.append(port)
+        self.heads.append((port, imu.model))
         parts = {"model": who.model, "board": who.board, "firmware": who.firmware}
         yield fine("imu", FindingCode.HEAD, port=port.path, **parts)
         return True

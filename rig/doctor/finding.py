@@ -96,6 +96,7 @@ class FindingCode(Enum):
     IMU_NOTE = "{note}"
     I2C_NOT_OPENED = "{bus} cannot be opened: {reason}"
     I2C_STUCK = "{bus} is stuck: {reason}; a device blocks the bus"
+    I2C_HANGS = "the controller of {bus} hangs: {reason}; it works again after its supply was off"
     I2C_FAILED = "{bus} fails at {address:#04x}: {reason}"
     KERNEL_DRIVER = "the kernel driver {driver} uses {address:#04x} of {bus}"
     CLOCK_STRETCHING = "{bus} runs at {khz:g} kHz and does not wait for a BNO055, which stretches the clock"

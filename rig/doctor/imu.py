@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rig.config import ImuConfig
+from rig.config.imus import imu_kind
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.bno055 import SLOW_BUS
 from rig.devices.head.head import open_head
@@ -63,8 +64,6 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
         bus, identity = context.computer.i2c_name(config.imu.bus), sensor.identity
         parts = {"model": identity.model, "address": identity.bus_address, "who_am_i": identity.who_am_i}
         yield fine("imu", FindingCode.IMU, bus=bus, **parts)
-        if here.note:
-            yield fine("imu", FindingCode.IMU_NOTE, note=here.note)
         # The sensor works: now its samples and its bus.
         yield from _at_rest(context, sensor)
         corrupt = getattr(getattr(sensor, "statistics", None), "corrupt", 0)
@@ -75,6 +74,8 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
 
 def _at_rest(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
     identity = sensor.identity
+    if note := imu_kind(context.config.imu.model).note:
+        yield fine("imu", FindingCode.IMU_NOTE, note=note)
     context.identities["imu"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
     yield from _rest(context, sensor, _samples(context, sensor))
     yield from _gravity(context, sensor)

@@ -4,8 +4,10 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from rig.devices.i2c import DESIGNWARE
 from sim.devices import SimDevices
 from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
+from sim.i2c import SimI2cBus
 from sim.imu.inertial import Words
 
 Values = Mapping[str, float]
@@ -100,6 +102,19 @@ def _nack(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
 def _i2c_stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
     devices.i2c.stuck = True
     return lambda: setattr(devices.i2c, "stuck", False)
+
+
+@simulated_fault("i2c_hang", "The computer's I2C controller hangs, as that of a Raspberry Pi 5 can. No transfer ends.")
+def _i2c_hang(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    bus = devices.i2c
+    if not isinstance(bus, SimI2cBus):  # a rig head has its own controller
+        return lambda: None
+    name, bus.name, bus.stuck = bus.name, DESIGNWARE, True
+
+    def restore() -> None:
+        bus.name, bus.stuck = name, False
+
+    return restore
 
 
 @simulated_fault("imu_saturated", "The gyro reports the maximum of its range.")

@@ -6,6 +6,7 @@ import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pkgutil import resolve_name
 
 import pytest
 import serial
@@ -58,6 +59,10 @@ def mpu6050() -> HeadSensor:
     return head_sensor(ImuConfig())
 
 
+def mpu6500() -> HeadSensor:
+    return head_sensor(ImuConfig(model="mpu6500"))
+
+
 def bno055() -> HeadSensor:
     return head_sensor(ImuConfig(model="bno055"))
 
@@ -88,11 +93,7 @@ def opened_head(
     """Yield a driver on a simulated head with its sensor."""
     with simulated_head(kind, noise, clock_error=clock_error) as (head, world):
         settings = sensor()
-        device = (
-            SimMpu6050(head.world_at_board_time)
-            if settings.kind.key == "mpu6050"
-            else SimBno055(head.world_at_board_time)
-        )
+        device = resolve_name(settings.kind.simulator)(head.world_at_board_time)
         head.attach(device.address, device)
         wire = HeadSerial(head)
         again = (lambda: reopen(head)) if reopen else None

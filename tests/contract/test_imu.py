@@ -112,6 +112,7 @@ SENSORS: dict[str, Callable[[NoiseModel], Opened]] = {
     "bno055": on_i2c(Bno055, SimBno055, 0x28, 0.02, 0.01),
     "device-file": device_file,
     "head": on_head("memory", heads.mpu6050, 0.007),
+    "head-mpu6500": on_head("memory", heads.mpu6500, 0.007),
     "head-bno055": on_head("memory", heads.bno055, 0.02, resolution_dps=1 / 16),
     "head-avr": on_head("avr", heads.mpu6050, 0.007),
     "head-pty": pseudo_terminal,

@@ -220,6 +220,12 @@ SCENARIOS: dict[str, Scenario] = {
         survived("i2c_nack", "transfer error; the transfer is repeated and counted"),
         stopped("i2c_stuck@move3", 402, "three timeouts of the kernel", "power-cycle the sensor"),
         stopped(
+            "i2c_hang@move3",
+            422,
+            "four timeouts of this adapter, the last one after the bus was opened again",
+            "power-cycle the computer",
+        ),
+        stopped(
             "imu_saturated@move3",
             404,
             "the gyro's rate is the maximum of its range",

@@ -48,6 +48,7 @@ VOCABULARY = {
         "object_moved",
         "i2c_nack",
         "i2c_stuck",
+        "i2c_hang",
     ),
     *("imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker"),
     *("mains_flicker", "disk_full", "clock_jump"),

@@ -16,11 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.config import HeadConfig, RigConfig
-from rig.config.imus import likely_device
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import (
     DeviceFault,
-    DeviceMismatch,
     DeviceSilent,
     EmergencyStop,
     HeadRestarted,
@@ -53,7 +51,8 @@ from rig.devices.head.protocol import (
     Triggered,
 )
 from rig.devices.head.samples import HeadClock, HeadSensor, SampleStream, head_sensor
-from rig.devices.imu import ImuIdentity, ImuSamples
+from rig.devices.imu import ImuIdentity, ImuSamples, another_sensor
+from rig.devices.mpu6050 import Mpu6050Clone, check_clone
 
 POWER_UP_S = 0.6
 """Time from closing the relay of the servo's supply until the servo answers."""
@@ -146,15 +145,8 @@ def sensor_error(status: HeadStatus, sensor: HeadSensor, port: str) -> RigError:
     place = f"I2C address {sensor.setup.address:#04x} of the rig head at {port}"
     evidence = {"imu_status": status.imu_status.name.lower()}
     match status.imu_status:
-        case ImuStatus.WRONG_ID:
-            (expected,) = sensor.kind.identities
-            likely = likely_device(sensor.kind, sensor.setup.address, status.who_am_i)
-            return DeviceMismatch(
-                f"WHO_AM_I at {place} is {status.who_am_i:#04x}, expected {expected:#04x} ({sensor.kind.name}): "
-                f"probably {likely}.",
-                next_step="Check the wiring, imu.model and imu.address.",
-                evidence={"got": status.who_am_i, "expected": expected},
-            )
+        case ImuStatus.WRONG_ID | ImuStatus.RUNNING if status.who_am_i not in sensor.kind.identities:
+            return another_sensor(sensor.kind, status.who_am_i, sensor.setup.address, f"the rig head at {port}")
         case ImuStatus.BUS_STUCK:
             return DeviceSilent(
                 f"The I2C bus of the rig head at {port} is stuck: SDA or SCL is held low.",
@@ -221,11 +213,13 @@ class RigHead:
             self._link.greet()
             self._begin()
             self._wait_until_running()
+            # Beside the work, not in its control loop: a slow disk or the operator takes longer than a deadman.
+            self._cancel = clock.every(deadman_s / HEARTBEATS_PER_DEADMAN, self._in_background)
+            if sensor.kind is Mpu6050Clone.KIND:
+                check_clone(self, clock, f"of the rig head at {name}")
         except BaseException:
             self.close()
             raise
-        # Beside the work, not in its control loop: a slow disk or the operator takes longer than a deadman.
-        self._cancel = clock.every(deadman_s / HEARTBEATS_PER_DEADMAN, self._in_background)
 
     # -- IMU --------------------------------------------------------------------------------------------------------
 
@@ -475,16 +469,22 @@ class RigHead:
 
     def _wait_until_running(self) -> None:
         deadline_ns = self._clock.now_ns() + round(self._sensor.start_s * 1e9)
-        while self._stream.newest is None:
+        while self._stream.newest is None or self._another_sensor:
             self._poll()
-            if self._clock.now_ns() > deadline_ns or self._status.imu_status == ImuStatus.WRONG_ID:
+            if self._clock.now_ns() > deadline_ns or self._another_sensor:
                 self._heartbeat()
                 raise self._sensor_error()
             self._clock.sleep(0.005)
 
+    @property
+    def _another_sensor(self) -> bool:
+        """Whether another sensor answers than the configured one, also one that the head can read."""
+        known = self._status.imu_status in (ImuStatus.WRONG_ID, ImuStatus.RUNNING)
+        return known and self._status.who_am_i not in self._sensor.kind.identities
+
     def _check_sensor(self) -> None:
         """Raise the sensor's error, after the head had time to set it up again."""
-        if self._status.imu_status == ImuStatus.WRONG_ID or (
+        if self._another_sensor or (
             self._status.imu_status != ImuStatus.RUNNING
             and seconds_between(self._sensor_lost_ns, self._clock.now_ns()) > max(RECOVERY_S, self._sensor.start_s)
         ):

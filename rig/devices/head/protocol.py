@@ -61,7 +61,7 @@ class Input(IntFlag):
 
 
 class ImuModel(IntEnum):
-    """Sensors that the head supports."""
+    """Sensors that the head supports; `mpu6050` is any sensor with its registers and a known WHO_AM_I."""
 
     NONE = 0
     MPU6050 = 1

@@ -74,23 +74,26 @@ def head_sensor(config: ImuConfig) -> HeadSensor:
             temperature_c=float,
             start_s=6.0,
         )
-    if config.model != "mpu6050":
+    driver = mpu6050.DRIVERS.get(config.model)
+    if driver is None:
         raise ConfigError(
             f"A rig head does not support the sensor {config.model!r}.",
-            next_step="Set imu.model to mpu6050 or bno055, or connect the sensor to the computer's own I2C bus.",
+            next_step=f"Set imu.model to {', '.join(mpu6050.DRIVERS)} or bno055, or connect the sensor to the "
+            "computer's own I2C bus.",
         )
+    lsb_per_c, zero_c = driver.TEMPERATURE
     registers = mpu6050.settings(config.range_dps, config.rate_hz, config.bandwidth_hz)
     divider, dlpf, full_scale, _ = registers[mpu6050.SMPLRT_DIV]
     lsb_per_dps = mpu6050.LSB_PER_DPS[config.range_dps]
     return HeadSensor(
-        kind=mpu6050.Mpu6050.KIND,
+        kind=driver.KIND,
         setup=SetImu(ImuModel.MPU6050, config.address, divider=divider, filter=dlpf, range=full_scale >> 3),
         rate_hz=1000.0 / (divider + 1),
         range_dps=32767 / lsb_per_dps,
-        noise_dps_rthz=mpu6050.NOISE_DPS_RTHZ,
+        noise_dps_rthz=driver.NOISE_DPS_RTHZ,
         lsb_per_dps=lsb_per_dps,
         lsb_per_g=mpu6050.LSB_PER_G,
-        temperature_c=lambda raw: raw / 340 + 36.53,
+        temperature_c=lambda raw: raw / lsb_per_c + zero_c,
         start_s=0.6,
     )
 

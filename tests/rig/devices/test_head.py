@@ -1,8 +1,11 @@
 """The rig head's driver on the firmware itself: opening, outputs, and safety functions."""
 
+from pkgutil import resolve_name
+
 import pytest
 
-from rig.config import load_config
+from rig.config import ImuConfig, load_config
+from rig.config.imus import imu_kind
 from rig.core.errors import (
     ConfigError,
     DeviceMismatch,
@@ -25,14 +28,16 @@ from rig.devices.head.protocol import (
     HeadState,
     Reset,
 )
+from rig.devices.head.samples import head_sensor
+from rig.devices.mpu6050 import DRIVERS
 from sim.clock import VirtualClock
 from sim.head import build
 from sim.head.board import SimHead
 from sim.head.serial_port import HeadSerial
-from sim.imu.mpu6050 import SimMpu6050
+from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone
 from sim.noise import NoiseModel
 from sim.world import World
-from tests.contract.heads import AVR_NIGHTLY, mpu6050, needs, opened_head, simulated_head, switch_on
+from tests.contract.heads import AVR_NIGHTLY, counters, mpu6050, needs, opened_head, simulated_head, switch_on
 
 MS = 1_000_000
 
@@ -105,8 +110,58 @@ def test_missing_or_wrong_sensor_is_reported():
             RigHead(HeadSerial(head), world.clock, mpu6050())
         assert caught.value.evidence["imu_status"] == "absent"
         head.attach(0x68, SimMpu6050(head.world_at_board_time, who_am_i=0x70))
-        with pytest.raises(DeviceMismatch, match=r"0x70, expected 0x68.*MPU-6500"):
+        with pytest.raises(DeviceMismatch, match=r"0x70, expected 0x68.*MPU-6500") as caught:
             RigHead(HeadSerial(head), world.clock, mpu6050())
+        assert caught.value.steps == (Do.SET_KEY(key="imu.model", value="mpu6500"),)
+        head.detach(0x68)
+        head.attach(0x68, clock_chip := SimMpu6050(head.world_at_board_time, who_am_i=0x00))
+        with pytest.raises(DeviceMismatch, match=r"0x00, expected 0x68 .*no device"):
+            RigHead(HeadSerial(head), world.clock, mpu6050())
+        assert clock_chip._registers[0x6B] == 0x40  # nothing was written to it
+
+
+PARTS = [("mpu6050", 0x68, 1024), ("mpu6500", 0x70, 512), ("mpu9250", 0x71, 512), ("mpu6050_clone", 0x72, 512)]
+
+
+def sensor_of(model):
+    return lambda: head_sensor(ImuConfig(model=model))
+
+
+@pytest.mark.parametrize("kind", ["memory", pytest.param("avr", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("model", "who_am_i", "fifo_bytes"), PARTS)
+def test_sensors_with_the_registers_of_the_mpu6050_have_their_own_scale_and_fifo(kind, model, who_am_i, fifo_bytes):
+    on_the_computer = resolve_name(imu_kind(model).driver)
+    with opened_head(kind, sensor=sensor_of(model)) as h:
+        who = h.imu.identity
+        assert (who.model, who.who_am_i) == (imu_kind(model).name, who_am_i)
+        assert who.gyro_noise_dps_rthz == on_the_computer.NOISE_DPS_RTHZ
+        h.sensor.temperature_c = 31.5
+        h.clock.sleep(0.1)
+        assert h.imu.temperature_c() == pytest.approx(31.5, abs=0.01)
+        for frames, overflows in ((fifo_bytes // 14 - 2, 0), (fifo_bytes // 14, 1)):  # as after a wait
+            h.sensor._fifo[:] = bytes(14 * frames)
+            h.clock.sleep(0.3)
+            h.imu.read_samples()
+            assert counters(h).fifo_overflows == overflows
+
+
+def test_every_identity_of_a_driver_is_known_to_the_firmware():
+    identities = [(driver.KIND, one) for driver in DRIVERS.values() for one in driver.KIND.identities]
+    assert len(identities) == 5
+    for kind, who_am_i in identities:
+        with simulated_head() as (head, world):
+            head.attach(0x68, resolve_name(kind.simulator)(head.world_at_board_time, who_am_i=who_am_i))
+            imu = RigHead(HeadSerial(head), world.clock, sensor_of(kind.key)())
+            assert imu.identity.who_am_i == who_am_i
+            imu.close()
+
+
+def test_clone_with_implausible_samples_is_rejected():
+    with simulated_head() as (head, world):
+        head.attach(0x68, clone := SimMpu6050Clone(head.world_at_board_time))
+        clone.inertial.accel_bias_g = clone.inertial.up
+        with pytest.raises(DeviceMismatch, match=r"clone at .* of the rig head at .*: gravity is 2\.0"):
+            RigHead(HeadSerial(head), world.clock, sensor_of("mpu6050_clone")())
 
 
 def test_only_deadmen_of_the_head_can_be_configured():

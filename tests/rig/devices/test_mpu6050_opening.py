@@ -1,6 +1,8 @@
 """Opening an MPU-6050 over the real smbus2: settings, sensors with the same registers, clones, missing devices."""
 
 import stat
+from errno import EAGAIN, EREMOTEIO, ETIMEDOUT
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from smbus2.smbus2 import I2C_SMBUS
 
 from rig.config import load_config
-from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
+from rig.core.errors import ConfigError, ControllerHangs, DeviceFault, DeviceMismatch, DeviceNotFound
 from rig.core.next_steps import Do
+from rig.devices.bno055 import Bno055
+from rig.devices.i2c import DESIGNWARE
 from rig.devices.mpu6050 import Mpu6050, Mpu6050Clone, Mpu6500, Mpu9250
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.clock import VirtualClock
+from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone, SimMpu6500, SimMpu9250
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
@@ -151,6 +157,32 @@ def test_missing_sensor_names_address_and_next_step(bench: ImuBench) -> None:
         bench.open()
     for hint in ("AD0", "i2cdetect -y", "SDA"):
         assert hint in caught.value.next_step
+
+
+def test_controller_that_hangs_has_its_own_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def opened(adapter: str, *failures: int, device: Any = SimMpu6050, driver: Any = Mpu6050) -> Any:
+        with ImuBench(device=device, driver=driver) as bench:
+            waiting, kernel = list(failures), bench.bus.ioctl
+            bench.bus.name = adapter
+
+            def ioctl(fd: int, request: int, argument: Any) -> int:
+                if waiting and request == I2C_SMBUS:
+                    raise OSError(waiting.pop(0), "")
+                return kernel(fd, request, argument)
+
+            monkeypatch.setattr(bench.bus, "ioctl", ioctl)
+            return bench.open().identity.model
+
+    for parts in ({}, {"device": SimBno055, "driver": partial(Bno055, address=0x28)}):
+        for failures in ((ETIMEDOUT,) * 4, (EREMOTEIO, ETIMEDOUT, EREMOTEIO, EAGAIN)):
+            with pytest.raises(ControllerHangs, match="hangs") as caught:
+                opened(DESIGNWARE, *failures, **parts)
+            assert "off for 10 seconds" in caught.value.next_step
+    with pytest.raises(DeviceNotFound):  # an unplugged sensor
+        opened(DESIGNWARE, *(EREMOTEIO,) * 3)
+    with pytest.raises(DeviceNotFound):
+        opened("bcm2835 (i2c@7e804000)", *(ETIMEDOUT,) * 3)
+    assert opened(DESIGNWARE, *(ETIMEDOUT,) * 3) == "MPU-6050"  # after the bus was opened again
 
 
 def test_missing_bus_names_how_to_enable_it(tmp_path: Path) -> None:

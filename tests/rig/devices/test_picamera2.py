@@ -93,6 +93,23 @@ def test_frames_are_copies_in_the_order_of_opencv_and_buffers_are_given_back(wor
     open_capture("picamera2").release()  # it can be opened again
 
 
+@pytest.mark.parametrize(
+    ("model", "rates"), [("imx219", (41.85, 41.85, 21.19, 21.19)), ("imx708", (56.03, 56.03, 56.03, 14.35))]
+)
+def test_frame_has_the_whole_field_of_the_sensor_at_any_size(model, rates, world, monkeypatch):
+    sensor = SimCapture(world)
+    monkeypatch.setitem(sys.modules, "picamera2", picamera2.module(sensor, world.clock, model))
+    capture = open_capture("picamera2")
+    for size, fps in zip(((320, 240), (640, 480), (1920, 1080), (4608, 2592)), rates, strict=True):
+        for prop, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), size, strict=True):
+            capture.set(prop, value)
+        capture.set(cv2.CAP_PROP_FPS, 90)
+        assert capture.get(cv2.CAP_PROP_FPS) == fps
+        assert capture.grab()
+        assert capture._camera.field == 1.0
+        np.testing.assert_array_equal(capture.retrieve()[1], sensor.retrieve()[1])
+
+
 def test_hanging_sensor_is_silent_in_bounded_time(world, sensor):
     camera = OpenCvCamera(open_capture("picamera2"), clock=world.clock)
     sensor.hangs = True

@@ -18,8 +18,8 @@ C920 = {
 }
 
 
-def driver(formats, *, stepwise=False):
-    """Return the ``ioctl`` of a camera driver, after linux/videodev2.h."""
+def driver(formats, *, stepwise=False, controls=None):
+    """Return the ``ioctl`` of a camera driver, after linux/videodev2.h; ``controls`` have smallest, largest, step."""
 
     def answer(_file, request, argument):
         index = int.from_bytes(argument[:4], "little")
@@ -34,6 +34,8 @@ def driver(formats, *, stepwise=False):
                     if stepwise:
                         return argument[:8] + words(2, 16, width, 16, 16, height, 16, 0, 0)
                     return argument[:8] + words(1, width, height, *(0,) * 6)
+                case 0xC0445624:
+                    return argument[:40] + words(*controls[number(0)]) + argument[52:]
                 case 0xC034564B:
                     numerator, denominator = formats[argument[4:8]][number(8), number(12)][index]
                     return argument[:16] + words(1, numerator, denominator, *(0,) * 6)

@@ -13,6 +13,7 @@ from rig.config.imus import imu_kinds
 from rig.core.errors import DeviceNotFound
 from rig.core.next_steps import Do
 from rig.devices.dynamixel.registers import model_numbers
+from rig.devices.i2c import DESIGNWARE
 from rig.devices.imu import open_imu
 from rig.devices.v4l2 import CAPTURE, M2M, M2M_MPLANE, VideoMode, capabilities
 from rig.doctor.bus_scan import BAUD_RATES, BaudScan, scan_imus, scan_servos, without_echoes
@@ -210,6 +211,18 @@ def test_stuck_bus_is_reported_once_with_its_error(number, code, bench):
     assert {found.errno for found in scan_imus(bench.context.computer, 1)} == {number}
     codes = [f.code for f in run_checks(bench.context, DeviceScan().checks) if f.topic == "imu"]
     assert codes == [code, FindingCode.NO_IMU_FOUND]
+
+
+@pytest.mark.parametrize("adapter", [DESIGNWARE, "bcm2835 (i2c@7e804000)"])
+def test_controller_that_hangs_and_stuck_bus_are_distinguished_by_the_adapter(adapter, bench):
+    bench.devices.i2c.stuck, bench.devices.i2c.name = True, adapter
+    hangs = adapter == DESIGNWARE
+    problem = bench.problem("imu")
+    assert problem.code is (FindingCode.I2C_HANGS if hangs else FindingCode.I2C_STUCK)
+    assert ("off for 10 seconds" in problem.fix) == hangs
+    bench.devices.i2c.stuck = False
+    bench.devices.i2c.errors = dict.fromkeys((0x28, 0x29, 0x69, 0x6A, 0x6B), ETIMEDOUT)
+    assert not any(found.hangs for found in scan_imus(bench.context.computer, 1))  # one sensor answers
 
 
 @pytest.mark.parametrize("number", [ENXIO, EREMOTEIO, ENODEV, EIO, ETIMEDOUT])

@@ -10,9 +10,10 @@ import pytest
 from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore, Estimate
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
-from rig.core.errors import ConfigError, DeviceNotFound, DeviceSilent
+from rig.core.errors import ConfigError, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do
 from rig.doctor.checks import CHECKS
+from rig.doctor.device_scan import DeviceScan
 from rig.doctor.examination import Check, run_checks
 from rig.doctor.finding import Finding, FindingCode, Severity, finding_words, fine
 from sim.faults import Faults, fault_kinds
@@ -139,6 +140,7 @@ FOUND = {
     "imu.slow": ("imu", FindingCode.SAMPLES_MISSING),
     "imu_saturated": ("imu", FindingCode.SATURATED),
     "i2c_stuck": ("imu", FindingCode.I2C_STUCK),
+    "i2c_hang": ("imu", FindingCode.I2C_HANGS),
     "camera.off": ("camera", 400),
     "camera.stuck": ("camera", 402),
     "camera.garbage": ("camera", FindingCode.VIEW_REJECTED),
@@ -224,14 +226,31 @@ def test_clone_is_checked_and_named(who_am_i):
         assert FindingCode.IMU_NOTE in {f.code for f in bench.findings("imu")}
 
 
-def test_imu_on_a_rig_head_is_checked():
-    with unopened("imu.connection=head", "head.port=/dev/ttyUSB1") as bench:
+@pytest.mark.parametrize("model", ["mpu6050", "mpu6050_clone"])
+def test_imu_on_a_rig_head_is_checked(model):
+    with unopened("imu.connection=head", "head.port=/dev/ttyUSB1", f"imu.model={model}") as bench:
         set_up(bench)
         bench.computer.serial_port("ttyUSB1", serial="HEAD")
         assert not bench.problems("port", "servo", "imu")
-        assert FindingCode.HEAD in {f.code for f in bench.findings("imu")}
+        codes = {f.code for f in bench.findings("imu")}
+        assert FindingCode.HEAD in codes
+        assert (FindingCode.IMU_NOTE in codes) == (model == "mpu6050_clone")
         bench.devices.head.unplugged = True
         assert bench.problem("imu").parameters["error_code"] == DeviceNotFound.code
+
+
+def test_search_names_the_sensor_on_a_rig_head():
+    with unopened("imu.connection=head", "head.port=/dev/ttyUSB1") as bench:
+        set_up(bench)
+        bench.computer.serial_port("ttyUSB1", serial="HEAD")
+        bench.devices.imu.who_am_i = 0x70
+        scan = DeviceScan()
+        found = [one for one in run_checks(bench.context, scan.checks) if one.code is FindingCode.HEAD]
+        assert [one.parameters["model"] for one in found] == ["MPU-6500"]
+        assert scan.settings["imu", "model"] == "mpu6500"
+        bench.devices.imu.who_am_i = 0x00
+        codes = {one.parameters.get("error_code") for one in run_checks(bench.context, DeviceScan().checks)}
+        assert DeviceMismatch.code in codes
 
 
 def test_servo_behind_the_relay_is_not_reported_missing():
