@@ -12,8 +12,11 @@ from rig.views.charuco_board import CharucoBoard
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 from sim.optics import SUPERSAMPLING, Optics
 
+_BLACK, _WHITE = 25, 215  # levels of the print
+_LEVELS = np.clip(np.arange(256, dtype=np.float32) * (_WHITE - _BLACK) / 255 + _BLACK, 0, 255).astype(np.uint8)
+_COVERAGE = np.minimum(np.rint(np.arange(256) * (255 / _WHITE)), 255).astype(np.uint8)
+_NEIGHBOURS = np.ones((3, 3), np.uint8)
 TEXTURE_PX_MM = 10  # five texels for a pixel of the frame; fewer: corners are rounded; more: a board takes more memory
-_FAR = 1e4  # texels: outside every texture
 
 
 @dataclass(frozen=True)
@@ -86,24 +89,23 @@ class BoardOnPlatter:
         y = slice(max(y.start, rows[0]), min(y.stop, rows[1]))
         if x.start >= x.stop or y.start >= y.stop:  # out of the frame
             return
-        # A ray r meets the board's plane where the homography [r1 r2 t]⁻¹ takes it.
-        to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation])).astype(np.float32)
+        # A ray meets the board's plane where the homography [r1 r2 t]⁻¹ takes it; from there to texels.
+        to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation]))
+        margin = TEXTURE_PX_MM * self.board.margin_mm - 0.5
+        to_texels = np.array([[TEXTURE_PX_MM, 0, margin], [0, TEXTURE_PX_MM, margin], [0, 0, 1]]) @ to_board
         fine_y, fine_x = (slice(each.start * SUPERSAMPLING, each.stop * SUPERSAMPLING) for each in (y, x))
-        at = to_board[:, :2] @ self.optics.rays()[fine_y, :, fine_x]
-        at += to_board[:, 2:]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            places = at[:, :2] / at[:, 2:]
-        places *= TEXTURE_PX_MM
-        places -= 0.5
-        places += np.float32(TEXTURE_PX_MM * self.board.margin_mm)
-        if not at[:, 2].all():  # a ray is parallel to the board
-            np.nan_to_num(places, copy=False, nan=-_FAR)
-        np.clip(places, -_FAR, _FAR, out=places)
-        drawn = cv2.remap(self._texture, places[:, 0], places[:, 1], cv2.INTER_LINEAR)
+        places = cv2.perspectiveTransform(self.optics.rays()[fine_y, fine_x], to_texels)
+        drawn = cv2.remap(self._texture, places, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+        # The ground is 0 and the print is not, and the board's edge is white: there the level shows the coverage.
+        inside = cv2.erode(cv2.threshold(drawn, 0, 255, cv2.THRESH_BINARY)[1], _NEIGHBOURS)
+        covers = cv2.max(cv2.LUT(drawn, _COVERAGE), inside)
         size = (x.stop - x.start, y.stop - y.start)
-        seen = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        cover = seen[..., 1:] / 255
-        image[y, x] = np.clip(seen[..., :1] + image[y, x] * (1 - cover), 0, 255)
+        grey, cover = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (drawn, covers))
+        seen = image[y, x]
+        cv2.copyTo(cv2.merge([grey] * 3), cv2.threshold(cover, 254, 255, cv2.THRESH_BINARY)[1], seen)
+        edge = (cover > 0) & (cover < 255)
+        behind = seen[edge] * (1 - cover[edge, None] / np.float32(255))
+        seen[edge] = np.clip(grey[edge, None] + behind, 0, 255)
 
     def _box(self, rotation: Floats, translation: Floats) -> tuple[slice, slice]:
         """Return the columns and rows of the image that show the board."""
@@ -123,15 +125,13 @@ class BoardOnPlatter:
 
     @cached_property
     def _texture(self) -> NDArray[np.uint8]:
-        """The print (grey, premultiplied) and its coverage, uint8 (rows, columns, 2)."""
+        """The print, uint8 (rows, columns)."""
         return _texture(self.board)
 
 
 @lru_cache(maxsize=4)
 def _texture(board: CharucoBoard) -> NDArray[np.uint8]:
-    grey = board.picture(TEXTURE_PX_MM)
-    paper = np.clip(grey.astype(np.float32) * (215 - 25) / 255 + 25, 0, 255).astype(np.uint8)
-    return np.dstack([paper, np.full_like(paper, 255)])
+    return np.asarray(cv2.LUT(board.picture(TEXTURE_PX_MM), _LEVELS))
 
 
 def boards(optics: Optics) -> dict[str, BoardOnPlatter]:

@@ -113,7 +113,7 @@ class Optics:
         return np.asarray(seen @ np.linalg.inv(drawn))
 
     def rays(self) -> NDArray[np.float32]:
-        """Return where the ray of each sub-pixel meets the plane one unit in front of the lens, float32 (h, 2, w)."""
+        """Return where the ray of each sub-pixel meets the plane one unit in front of the lens, float32 (h, w, 2)."""
         return _rays(self)
 
 
@@ -128,4 +128,4 @@ def _rays(optics: Optics) -> NDArray[np.float32]:
     y = (np.arange(HEIGHT * SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
     rays = cv2.undistortPoints(grid, optics.matrix, np.array(optics.distortion))
-    return np.ascontiguousarray(rays.reshape(len(y), len(x), 2).transpose(0, 2, 1), dtype=np.float32)
+    return np.asarray(rays.reshape(len(y), len(x), 2), dtype=np.float32)

@@ -74,8 +74,13 @@ def _transaction(connection: Connection) -> Transaction:
 def create_tables(connection: Connection) -> None:
     """Create the tables of a new catalog."""
     Row.metadata.create_all(connection)
+    connection.execute(insert(Property), first_properties())
+
+
+def first_properties() -> list[dict[str, str]]:
+    """Return the properties of a new catalog."""
     first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex, "head": "0  0 0 0"}
-    connection.execute(insert(Property), [{"key": key, "value": value} for key, value in first.items()])
+    return [{"key": key, "value": value} for key, value in first.items()]
 
 
 def properties(connection: Connection | Transaction) -> dict[str, str]:

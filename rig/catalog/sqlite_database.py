@@ -9,7 +9,7 @@ import sqlite3
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -18,7 +18,7 @@ from sqlalchemy import DDL, Connection, Dialect, Engine, NullPool, QueuePool, St
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import FIX
-from rig.catalog.database import APPLICATION, Database, check_properties, create_tables, properties
+from rig.catalog.database import APPLICATION, Database, check_properties, first_properties, properties
 from rig.catalog.facts import FACTS, SCHEMA_VERSION, Entry, Row, json_text
 from rig.catalog.failures import absent, catalog_errors
 from rig.catalog.images import open_images
@@ -140,13 +140,15 @@ class SqliteDatabase(Database):
         with TemporaryDirectory(prefix=".new-", dir=self.root) as folder:
             made = Path(folder, DATABASE_NAME)
             made.touch(0o600)  # private; to share a catalog, users change the permissions of its database
-            engine = create_engine("sqlite://", creator=partial(sqlite3.connect, made), poolclass=NullPool)
-            with engine.connect() as connection:
-                connection.exec_driver_sql("PRAGMA journal_mode = WAL")
-                create_tables(connection)
-                connection.exec_driver_sql(f"PRAGMA application_id = {APPLICATION_ID}")
-                connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
-                connection.commit()
+            with closing(sqlite3.connect(made, isolation_level=None)) as connection:
+                connection.execute("PRAGMA journal_mode = WAL")
+                connection.execute("BEGIN")
+                for definition in _definitions():
+                    connection.execute(definition)
+                connection.executemany("INSERT INTO properties (key, value) VALUES (:key, :value)", first_properties())
+                connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+                connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+                connection.execute("COMMIT")
             try:
                 self._file.hardlink_to(made)
             except FileExistsError:  # another process was faster, or one was killed after it had created an empty file
@@ -239,8 +241,18 @@ def _schema(database: sqlite3.Connection) -> dict[str, str]:
 @cache
 def _expected_schema() -> dict[str, str]:
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
-        Row.metadata.create_all(create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool))
+        for definition in _definitions():
+            connection.execute(definition)
         return _schema(connection)
+
+
+@cache
+def _definitions() -> tuple[str, ...]:
+    """Return the statements that create the tables and triggers; SQLAlchemy would compile them for each catalog."""
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        Row.metadata.create_all(create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool))
+        rows = connection.execute("SELECT sql FROM sqlite_master WHERE name NOT GLOB 'sqlite_*' ORDER BY rowid")
+        return tuple(definition for (definition,) in rows)
 
 
 def _begin(connection: Connection) -> None:

@@ -128,7 +128,9 @@ class SimMpu6050:
         return acknowledged
 
     def read(self, count: int) -> bytes:
-        self._take_samples()  # once for each burst: its bytes belong to one sample
+        # Once for each burst: its bytes belong to one sample. Those that wait in the FIFO need no later samples.
+        if self._pointer != FIFO_R_W or count > len(self._fifo) or self._overflows():
+            self._take_samples()
         answer = bytearray()
         while len(answer) < count:
             if self._pointer == FIFO_R_W:
@@ -187,16 +189,25 @@ class SimMpu6050:
         internal_hz = 8000 if self._registers[CONFIG] & 0x07 in (0, 7) else 1000
         return internal_hz, round(1e9 / internal_hz / (1 + self.clock_error))
 
+    def _due(self) -> int:
+        """Return the number of samples since the settings changed."""
+        if self._registers[PWR_MGMT_1] & SLEEP:
+            return self._taken
+        period_ns = self._internal_clock()[1] * (1 + self._registers[SMPLRT_DIV])
+        return (self._clock.now_ns() - self._epoch_ns) // period_ns
+
+    def _overflows(self) -> bool:
+        """Return whether the samples that are due may not fit into the FIFO."""
+        return len(self._fifo) + 2 * len(_FIFO_BITS) * (self._due() - self._taken) > self.FIFO_SIZE
+
     def _take_samples(self) -> None:
         """Take the samples that are due since the last call."""
-        registers = self._registers
-        if registers[PWR_MGMT_1] & SLEEP:
-            return
-        filter_setting, decimation = registers[CONFIG] & 0x07, 1 + registers[SMPLRT_DIV]
-        internal_hz, tick_ns = self._internal_clock()
-        due = (self._clock.now_ns() - self._epoch_ns) // (tick_ns * decimation)
+        due = self._due()
         if due == self._taken:
             return
+        registers = self._registers
+        filter_setting, decimation = registers[CONFIG] & 0x07, 1 + registers[SMPLRT_DIV]
+        internal_hz, tick_ns = self._internal_clock()
         first = max(self._taken, due - self.FIFO_SIZE // 2)  # the size of the FIFO: a frame has at least one word
         self._taken = due
         ticks = np.arange(first * decimation + 1, due * decimation + 1)

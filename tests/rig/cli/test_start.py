@@ -67,8 +67,9 @@ def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words,
     assert "°" not in done.stdout  # the table has not moved
 
 
-@pytest.mark.parametrize("moment", ["atexit", "threads"])
-@pytest.mark.parametrize("words", ["--version", "config show"])
+@pytest.mark.parametrize(
+    ("moment", "words"), [("atexit", "--version"), ("threads", "--version"), ("threads", "config show")]
+)
 def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, words, tmp_path):
     done = interrupted(tmp_path, moment, *words.split())
     assert (done.returncode, done.stderr) == (0, "")

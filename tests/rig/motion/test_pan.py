@@ -65,8 +65,7 @@ def test_azimuths_agree_whether_object_or_camera_rotates(
         assert min(unlike, key=lambda side: unlike[side]) == azimuth
 
 
-@pytest.mark.parametrize("photographs", [False, True])
-@pytest.mark.parametrize("strategy", ["ahbr", "dense"])
+@pytest.mark.parametrize(("strategy", "photographs"), [("ahbr", False), ("dense", False), ("dense", True)])
 def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strategy: str, photographs: bool) -> None:
     """The background differs in each view; whole frames (AHBR) and the rig's own search find the object again.
 
@@ -75,10 +74,10 @@ def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strat
     s = simulated(*ARM)
     with Catalog.open(tmp_path / "catalog", clock=s.bench.clock, create=True) as catalog:
         if photographs:
-            list(photograph_table(s.bench, views=12))
+            list(photograph_table(s.bench, views=8))
         for name in ("teapot", "mug-dots"):
-            views = [event for event in enroll(s.bench, catalog, name, views=12) if isinstance(event, Accepted)]
-            assert len(views) == 12
+            views = [event for event in enroll(s.bench, catalog, name, views=8) if isinstance(event, Accepted)]
+            assert len(views) == 8
         s.operator.next_object, s.operator.yaw_deg = "teapot", 10.0
         model = load_model(catalog, descriptor=descriptor_for(strategy_named(strategy)))
         with RunWriter(tmp_path / "run", s.bench, model) as writer:
@@ -117,7 +116,7 @@ def test_search_by_an_orbiting_camera_goes_where_an_image_was_taken(
     with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
         list(photograph_table(s.bench, views=12))
         for name in ("mug-star", "mug-white"):
-            list(enroll(s.bench, catalog, name, views=12))
+            list(enroll(s.bench, catalog, name, views=6))
         for limit in ("MIN_CONFIDENCE", "HOPELESS"):
             monkeypatch.setattr(stopping, limit, 2.0)  # so that the search takes all its views
         s.operator.next_object, s.operator.yaw_deg = "mug-white", 100.0
