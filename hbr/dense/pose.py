@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from hbr.core.angles import size_deg, wrap180, wrap360
+from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import Belief
 from hbr.dense.index import BIN_DEG, BINS, DenseIndex
@@ -39,11 +39,8 @@ _LEAST_PART: Final = 0.25
 #: An object looks the same from all sides if its likeliest azimuths, 95 % together, are at least this share of all.
 _FREE_SHARE: Final = 0.2  # a symmetry of two, three or more parts leaves most azimuths unlikely
 _ORDERS: Final = range(1, 13)  # up to 30°: finer symmetries are hardly visible with views 10° apart
-#: Poses of an object that a comparison tries: those of at least this probability, relative to the likeliest one.
-# more poses, or less likely ones: the right one is missed less often; each is registered again, which takes time
-_MOST_POSES: Final = 3
-_LEAST_POSE: Final = 0.02
-_POSES_APART_DEG: Final = 25.0
+#: Azimuths this near to the likeliest one count for the estimate.
+_AROUND_DEG: Final = 25.0
 _DEGREES: Final = np.arange(360.0)
 
 
@@ -72,16 +69,9 @@ def pose(belief: Belief, object_index: int) -> Pose:
     return pose_of(_log_p(belief, _alone(belief, object_index)))
 
 
-def poses_of(belief: Belief, object_index: int) -> tuple[float, ...]:
-    """Return the likely azimuths of an object at the last view, the likeliest first; symmetric objects have several."""
-    log_p = _log_p(belief, _alone(belief, object_index))
-    found = [_estimated_deg(log_p)]
-    for azimuth_deg in np.argsort(-log_p, kind="stable").tolist():
-        if log_p[azimuth_deg] < log_p.max() + np.log(_LEAST_POSE) or len(found) == _MOST_POSES:
-            break
-        if min(size_deg(azimuth_deg - np.array(found))) >= _POSES_APART_DEG:
-            found.append(float(azimuth_deg))
-    return tuple(found)
+def azimuth_of(belief: Belief, object_index: int) -> float:
+    """Return the likeliest azimuth of an object at the last view."""
+    return _estimated_deg(_log_p(belief, _alone(belief, object_index)))
 
 
 def pose_of(log_p: FloatArray) -> Pose:
@@ -104,7 +94,7 @@ def pose_of(log_p: FloatArray) -> Pose:
 def _estimated_deg(log_p: FloatArray) -> float:
     """Return the mean of the azimuths around the likeliest one."""
     away_deg = wrap180(_DEGREES - log_p.argmax())
-    near = _probability(log_p) * (np.abs(away_deg) <= _POSES_APART_DEG)
+    near = _probability(log_p) * (np.abs(away_deg) <= _AROUND_DEG)
     return float(wrap360(log_p.argmax() + near @ away_deg / near.sum()))
 
 

@@ -1,109 +1,58 @@
 """One search by the dense filter: views in; belief, decision and next best view out. It reads no image itself.
 
-Two steps compare its views with enrolled ones, pixel by pixel. They ask for enrolled views (`NeedEnrolledViews`); the
-driver of the search brings them:
-
-- `DenseSession.verify`, after each view at rest. The evidence compares descriptors of 8 x 8 cells. An object that is
-  not enrolled may resemble an enrolled one at this coarse scale, although its details do not fit. For each view, the
-  enrolled views at the estimated pose are registered to it. The fit is the share of its contrast that they explain, in
-  colours that light hardly changes. It is a part of the posterior (`hbr.dense.stopping`).
-- `DenseSession.compare`, for the two leaders of a search that does not end with one object.
-
-The comparisons themselves are in `hbr.dense.local_difference`.
+`DenseSession.verify`, after each view at rest, compares the views with enrolled ones, pixel by pixel
+(`hbr.dense.pixel_fit`). The driver of the search brings the enrolled views at the estimated pose. The share of the
+views' contrast that they explain is a part of the posterior (`hbr.dense.stopping`).
 
 If the object was replaced or rotated by hand, the search begins again with the views since then (`hbr.dense.change`).
 
-Decisions: docs/decisions/0013, docs/decisions/0016, docs/decisions/0015, docs/decisions/0017.
+Decisions: docs/decisions/0013, docs/decisions/0015, docs/decisions/0017.
 """
 
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar, Final, NamedTuple, TypeVar
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hbr.core.angles import size_deg, wrap180, wrap360
+from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.change import Change, changed
 from hbr.dense.evidence import near_twins
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.local_difference import (
-    NEAREST,
-    LocalDecision,
-    LocalView,
-    PixelFit,
-    Pixels,
-    chosen_views,
-    compare_objects,
-    fit,
-)
 from hbr.dense.next_view import NextBestView, next_best_view
-from hbr.dense.pose import poses_of
-from hbr.dense.stopping import (
-    ERROR_RATE,
-    HOPELESS,
-    Outcome,
-    StopDecision,
-    StopReason,
-    among_enrolled,
-    decide,
-    pair_odds,
-)
+from hbr.dense.pixel_fit import LocalView, PixelFit, Pixels, fit
+from hbr.dense.pose import azimuth_of
+from hbr.dense.stopping import HOPELESS, Outcome, StopDecision, among_enrolled, decide, pair_odds
 
+#: Enrolled views of a candidate that a view is compared with.
+NEAREST: Final = 2  # a view lies between two enrolled ones; further ones show other sides
 #: Segmentations of each view that are compared.
 _SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of every candidate
 #: Candidates that are compared with the views.
 _COMPARED: Final = 3  # the two leaders, and one more if these are near twins
 #: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search.
 _NOT_WORTH_A_FIT: Final = 0.95
-#: Share of the probability that the two leaders have together.
-LEADERS: Final = 0.9  # with less, a third object is likely, and a difference of two decides nothing
 
-_Result = TypeVar("_Result")
-
-
-class NeedEnrolledViews(NamedTuple):
-    """A search needs the enrolled views of an object, by its index in the views' names, near some azimuths.
-
-    The answer is None if they cannot be read: the search then ends without them.
-    """
-
-    object_index: int
-    azimuths_deg: tuple[float, ...]
-
-
-Asking = Generator[NeedEnrolledViews, Sequence[LocalView] | None, _Result]
-"""A step of a search that asks for enrolled views, and returns its result."""
+EnrolledViews = Callable[[int, Sequence[float]], Sequence[LocalView] | None]
+"""Returns the enrolled views of an object, by its index in the views' names, near some azimuths; None: it cannot."""
 Queries = Callable[[int], Sequence[LocalView]]
 """Returns a view of a search by each of its segmentations, the likeliest first."""
 
 
-def answered(
-    step: Asking[_Result], enrolled: Callable[[int, Sequence[float]], Sequence[LocalView] | None] = lambda *_: None
-) -> _Result:
-    """Return the result of a step; ``enrolled`` returns the enrolled views of an object near some azimuths."""
-    try:
-        need = next(step)
-        while True:
-            need = step.send(enrolled(*need))
-    except StopIteration as end:
-        result: _Result = end.value
-        return result
-
-
 def near(own_deg: ArrayLike, azimuths_deg: Sequence[float]) -> IndexArray:
-    """Return the indices of the views, at ``own_deg`` (n,), that a comparison near some azimuths needs, by azimuth.
-
-    There is one more than `NEAREST` for each azimuth, because the comparison leaves one out.
-    """
+    """Return the indices of the views, at ``own_deg`` (n,), that a comparison near some azimuths needs, by azimuth."""
     own_deg = np.asarray(own_deg, np.float64)
-    away_deg = np.abs(wrap180(own_deg - np.asarray(azimuths_deg)[:, None]))
-    wanted = np.unique(np.argsort(away_deg, axis=1, kind="stable")[:, : NEAREST + 1])
+    wanted = np.unique([_nearest(own_deg, azimuth_deg) for azimuth_deg in azimuths_deg])
     places: IndexArray = wanted[np.argsort(own_deg[wanted], kind="stable")]
     return places
+
+
+def _nearest(own_deg: FloatArray, azimuth_deg: float) -> IndexArray:
+    """Return the indices of the `NEAREST` views to an azimuth."""
+    return np.argsort(size_deg(own_deg - azimuth_deg), kind="stable")[:NEAREST]
 
 
 class Fits:
@@ -117,13 +66,13 @@ class Fits:
         self._of_pairs: dict[tuple[int, float, float], float] = {}
 
     def views(
-        self, object_index: int, own_deg: FloatArray, azimuths_deg: Sequence[float]
-    ) -> Asking[Sequence[LocalView] | None]:
+        self, object_index: int, own_deg: FloatArray, azimuths_deg: Sequence[float], enrolled: EnrolledViews
+    ) -> Sequence[LocalView] | None:
         """Return enrolled views of an object, those next to some azimuths among them; ``own_deg`` has those of all."""
         known = self._views.setdefault(object_index, {})
         unknown = [deg for deg in azimuths_deg if not known.keys() >= set(own_deg[_nearest(own_deg, deg)].tolist())]
         if unknown:
-            found = yield NeedEnrolledViews(object_index, tuple(unknown))
+            found = enrolled(object_index, unknown)
             if not found:
                 return None
             known.update((view.azimuth_deg, view) for view in found)
@@ -153,7 +102,7 @@ class Fits:
         return self._enrolled[key]
 
 
-def verify(belief: Belief, queries: Queries, fits: Fits | None = None) -> Asking[PixelFit | None]:
+def verify(belief: Belief, queries: Queries, enrolled: EnrolledViews, fits: Fits | None = None) -> PixelFit | None:
     """Compare the views of a search with the enrolled views of its leading candidates; None without such views.
 
     The queries are in the order of the belief's.
@@ -164,10 +113,10 @@ def verify(belief: Belief, queries: Queries, fits: Fits | None = None) -> Asking
     candidates = belief.index.object_index[places].tolist()
     means, beside = [], []
     for candidate in candidates:
-        pose_deg, *_ = poses_of(belief, candidate)
+        pose_deg = azimuth_of(belief, candidate)
         azimuths_deg = [wrap360(pose_deg + o - last_deg) for o in belief.orientation_deg.tolist()]
         own_deg = belief.index.views.azimuth_deg[belief.index.views.of(candidate)]
-        views = yield from fits.views(candidate, own_deg, azimuths_deg)
+        views = fits.views(candidate, own_deg, azimuths_deg, enrolled)
         if views is None:
             return None
         enrolled_deg = np.array([view.azimuth_deg for view in views])
@@ -183,86 +132,6 @@ def verify(belief: Belief, queries: Queries, fits: Fits | None = None) -> Asking
     expected = np.mean([fits.of_pair(candidates[leader], near[0], near[-1]) for near in beside[leader]])
     second = means[1 - leader] if len(candidates) > 1 else 0.0
     return PixelFit(candidates[leader], means[leader], second, max(others, default=0.0), float(expected))
-
-
-def _nearest(own_deg: FloatArray, azimuth_deg: float) -> IndexArray:
-    """Return the indices of the `NEAREST` views to an azimuth."""
-    return np.argsort(size_deg(own_deg - azimuth_deg), kind="stable")[:NEAREST]
-
-
-@dataclass(frozen=True, eq=False)
-class LeaderComparison:
-    """The two leaders of a search, compared.
-
-    Attributes
-    ----------
-    leaders : (int, int)
-        The likelier one first, as indices of the views' names.
-    compared : tuple of int
-        Which views of the search were compared.
-    views : pair of sequences of LocalView
-        The enrolled views of both leaders.
-    found : LocalDecision
-        What the comparison found.
-    winner : int or None
-        The leader that was found, as an index of the views' names; None if the comparison names none.
-    max_error : float
-        Largest probability that a decision is wrong.
-    """
-
-    leaders: tuple[int, int]
-    compared: tuple[int, ...]
-    views: tuple[Sequence[LocalView], Sequence[LocalView]]
-    found: LocalDecision
-    winner: int | None
-    max_error: float
-
-    def decided(self, decision: StopDecision) -> StopDecision:
-        """Return the decision that replaces the given one; its probability is that of the comparison."""
-        if self.winner is None:
-            return decision
-        return replace(
-            decision,
-            outcome=Outcome.FOUND,
-            reason=StopReason.LOCAL_DIFFERENCE,
-            object_index=self.winner,
-            probability=1.0 - self.found.error_bound,
-            min_confidence=1.0 - self.max_error,
-        )
-
-
-def compare_leaders(
-    belief: Belief, outcome: Outcome, queries: Queries, *, max_error: float = ERROR_RATE
-) -> Asking[LeaderComparison | None]:
-    """Compare the two leaders of a search that is ambiguous; None if it has no two.
-
-    ``outcome`` is that with which the search would end, and ``max_error`` the largest probability that a decision is
-    wrong.
-    """
-    if outcome is not Outcome.AMBIGUOUS:
-        return None
-    probability = belief.probability()
-    order = np.argsort(-probability, kind="stable")[:2]
-    if len(order) < 2 or float(probability[order].sum()) < LEADERS:
-        return None
-    first, second = belief.index.object_index[order].tolist()
-    orientations_deg = belief.orientation_deg.tolist()
-    compared = chosen_views(orientations_deg)
-    rotations_deg = [tuple(deg - orientations_deg[-1] for deg in poses_of(belief, one)) for one in (first, second)]
-    enrolled = []
-    for leader, rotations in zip((first, second), rotations_deg, strict=True):
-        near_deg = [float(wrap360(orientations_deg[n] + added_deg)) for added_deg in rotations for n in compared]
-        views = yield NeedEnrolledViews(leader, tuple(near_deg))
-        if views is None:
-            return None
-        enrolled.append(views)
-    if min(map(len, enrolled)) <= NEAREST:
-        return None
-    both = enrolled[0], enrolled[1]
-    likeliest = [queries(n)[0] for n in compared]
-    found = compare_objects(likeliest, both, (rotations_deg[0], rotations_deg[1]), max_error=max_error)
-    winner = None if found.winner is None else (first, second)[found.winner]
-    return LeaderComparison((first, second), tuple(compared), both, found, winner, max_error)
 
 
 #: Number of times that a search begins again because the object changed.
@@ -300,8 +169,6 @@ class DenseSession:
         Whether the last view led to a decision.
     verification : PixelFit, optional
         The fit of the leader after the last view, if it was measured.
-    comparison : LeaderComparison, optional
-        The comparison of the two leaders after the last view, if there was one.
     """
 
     belief: Belief
@@ -309,7 +176,6 @@ class DenseSession:
     present: StopDecision
     is_new_decision = True
     verification: PixelFit | None = None
-    comparison: LeaderComparison | None = None
     left_out = 0
     change: Change | None = None
     _NEWEST: ClassVar[int] = 2
@@ -357,7 +223,7 @@ class DenseSession:
             Whether the table moved without a command since the view before, as if by hand.
         """
         self._reliable, self._other_bench = reliable, other_bench
-        self.verification = self.comparison = None  # they were for the views before
+        self.verification = None  # it was for the views before
         if earlier is not None:
             self._replace(earlier)
         self._begin_view(orientation_deg)
@@ -459,22 +325,15 @@ class DenseSession:
         return among_enrolled(self.belief, self.verification)
 
     def end(self) -> StopDecision:
-        """Return the decision with which the search ends here, even if it would continue.
+        """Return the decision with which the search ends here, even if it would continue."""
+        return self.decision if self.decision.outcome is not Outcome.CONTINUE else self._decide(last=True)
 
-        The steps that were taken after the last view count.
-        """
-        decision = self.decision
-        if decision.outcome is Outcome.CONTINUE:
-            decision = self._decide(last=True)
-        return decision if self.comparison is None else self.comparison.decided(decision)
+    def verify(self, queries: Queries, enrolled: EnrolledViews) -> PixelFit | None:
+        """Compare the leader with the views pixel by pixel, and decide again; None if that is not worth its time."""
+        return self.use(verify(self.belief, queries, enrolled, self._fits) if self._is_worth_a_fit() else None)
 
-    def verify(self, queries: Queries, measured: PixelFit | None = None) -> Asking[PixelFit | None]:
-        """Compare the leader with the views pixel by pixel, and decide again; None if that is not worth its time.
-
-        A fit that was ``measured`` before is used instead of enrolled views.
-        """
-        if measured is None and self._is_worth_a_fit():
-            measured = yield from verify(self.belief, queries, self._fits)
+    def use(self, measured: PixelFit | None) -> PixelFit | None:
+        """Decide again by a measured fit, and return it."""
         self.verification = measured
         if measured is not None:
             self.decision = self.present = self._decide()
@@ -483,12 +342,6 @@ class DenseSession:
     def _is_worth_a_fit(self) -> bool:
         last = self.belief.queries >= self.max_views
         return (last or self._reliable) and self.decision.not_enrolled < (HOPELESS if last else _NOT_WORTH_A_FIT)
-
-    def compare(self, queries: Queries) -> Asking[LeaderComparison | None]:
-        """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None."""
-        self.comparison = None
-        self.comparison = yield from compare_leaders(self.belief, self.end().outcome, queries)
-        return self.comparison
 
     def _weight(self, orientation_deg: float) -> float | None:  # noqa: ARG002
         """Return the weight of the next view; None: 1."""

@@ -26,7 +26,7 @@ import numpy as np
 from hbr.core.arrays import FloatArray
 from hbr.dense.evidence import COMMON, numbers
 from hbr.dense.filter import Belief
-from hbr.dense.local_difference import PixelFit
+from hbr.dense.pixel_fit import PixelFit
 
 WEIGHTS: Final = "evidence.json"
 #: Probability of the leading candidate that ends a search, and that is enough after its last view.
@@ -37,8 +37,6 @@ LAST_CONFIDENCE: Final = 0.8
 HOPELESS: Final = 0.998
 #: After the last view, an object is unknown from this probability on, and otherwise ambiguous.
 UNKNOWN_FROM: Final = 0.8
-#: Share of wrong objects among those that a comparison of two leaders names.
-ERROR_RATE: Final = 0.01
 
 
 class Outcome(StrEnum):
@@ -60,7 +58,6 @@ class StopReason(StrEnum):
     MARGIN = "margin"
     MAX_VIEWS = "max-views"
     NO_ROTATION_LEFT = "no-rotation-left"
-    LOCAL_DIFFERENCE = "local-difference"
     CUSTOM = "custom"
 
 

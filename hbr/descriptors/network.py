@@ -11,7 +11,7 @@ fitted to objects 1-50 of COIL-100 on drawn benches (`python -m benchmarks.fit_p
 
 Source: M. Tan and Q. V. Le, "EfficientNet: Rethinking model scaling for convolutional neural networks", ICML 2019.
 
-Decision: docs/decisions/0024.
+Decision: docs/decisions/0016.
 """
 
 import pickle

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.dense.index import DenseIndex
-from hbr.dense.local_difference import LocalView
+from hbr.dense.pixel_fit import LocalView
 from hbr.dense.pose import pose
-from hbr.dense.session import DenseSession, Queries, answered, near
+from hbr.dense.session import DenseSession, near
 from hbr.dense.stopping import Outcome
 from hbr.descriptors.together import ViewsTogether
 from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
@@ -57,15 +57,11 @@ class SearchResult:
     outcome : Outcome
         Outcome of the search within four views.
     decided : str
-        The leading object at the end, or the one that the comparison of the two leaders named.
+        The leading object at the end.
     views : int
         Views until the end.
-    compared : bool
-        Whether its two leaders were compared pixel by pixel (`hbr.dense.session`).
-    by_comparison : bool
-        Whether that comparison changed the outcome.
     verified : bool
-        Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.session`).
+        Whether the last views were compared with enrolled ones, pixel by pixel (`hbr.dense.session`).
     pose : StatedPose
         Of the leading object at the end.
     probability, not_enrolled : float
@@ -81,8 +77,6 @@ class SearchResult:
     decided: str
     views: int
     pose: StatedPose = field(default=StatedPose(0))
-    compared: bool = False
-    by_comparison: bool = False
     verified: bool = False
     probability: float = 0.0
     not_enrolled: float = 0.0
@@ -248,28 +242,19 @@ class _Search:
         def queries(n: int) -> list[LocalView]:
             return [LocalView(one.crop, one.mask, orientations_deg[n]) for one in views.segmentations[n]]
 
-        answered(session.verify(queries), self._near)
+        session.verify(queries, self._near)
         if session.decision.outcome is not Outcome.CONTINUE:
-            self._result = self._ended(queries)
-
-    def _ended(self, queries: Queries) -> SearchResult:
-        """Return the result of a search that ends after its last view."""
-        session = self._session
-        before = session.end()
-        comparison = answered(session.compare(queries), self._near)
-        end = session.end()
-        return SearchResult(
-            (),
-            end.outcome,
-            self._names[end.object_index],
-            len(self._leaders),
-            self._stated(end.object_index),
-            comparison is not None,
-            end.outcome is not before.outcome,
-            session.verification is not None,
-            end.probability,
-            end.not_enrolled,
-        )
+            end = session.decision
+            self._result = SearchResult(
+                (),
+                end.outcome,
+                self._names[end.object_index],
+                len(self._leaders),
+                self._stated(end.object_index),
+                session.verification is not None,
+                end.probability,
+                end.not_enrolled,
+            )
 
     def _stated(self, leader: int) -> StatedPose:
         belief = self._session.belief
@@ -318,9 +303,6 @@ def summary(
         "called_unknown": sum(one.outcome is Outcome.UNKNOWN for _, one in searches) / count,
         "ambiguous": sum(one.outcome is Outcome.AMBIGUOUS for _, one in searches) / count,
         "verified": sum(one.verified for _, one in searches) / count,
-        "compared": sum(one.compared for _, one in searches) / count,
-        "right_by_comparison": sum(one.by_comparison and one.decided == name for name, one in found) / count,
-        "wrong_by_comparison": sum(one.by_comparison and one.decided != name for name, one in found) / count,
         "mean_views": sum(one.views for _, one in found) / max(1, len(found)),
         **pose_rates(np.array([one.pose for name, one in found if one.decided == name], np.float64).reshape(-1, 4)),
         "unknown_searches": len(others),

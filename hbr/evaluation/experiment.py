@@ -12,7 +12,7 @@ from hbr.evaluation.protocol import Method, Protocol
 KindName = Literal["trials", "matrix", "bench-change", "replaced"]
 Change = Literal["none", "mild", "hard"]
 #: Increased if the same settings give other numbers.
-FORMAT: Final = 11
+FORMAT: Final = 12
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,6 @@ from hbr.paper.index import Method as IndexMethod
 Removal = Literal["near", "paper79", "queries"]
 #: Codes of `Runs.outcome`.
 OUTCOMES: Final = (Outcome.CONTINUE, Outcome.FOUND, Outcome.UNKNOWN, Outcome.AMBIGUOUS)
-#: Codes of `Runs.compared`: what a comparison of the two leaders names.
-COMPARED: Final = ("none", "right", "wrong")
 
 
 Strategy = Literal[
@@ -240,15 +238,12 @@ class Runs:
         `hbr.evaluation.poses.StatedPose` for the true object, where a search of the dense filter ends; else nan.
     margin : float64
         `hbr.score_margin` of the leading object per view; with the dense filter, its score minus the second score.
-    best : int32
-        The leading object, as an index of the views' names.
+    named : bool
+        Whether the true object leads. With the dense filter the decision counts, pixels included.
     score : float64
-        Its score per view.
+        The leading object's score per view.
     outcome : int8
         Decision of the stopping rule with the dense filter, as an index of `OUTCOMES`; -1 with the paper's voting.
-    compared : int8
-        Result of the comparison of the two leaders at the end of a search of the dense filter, as an index of
-        `COMPARED`; else -1.
     travelled_deg : float64
         Sum of the rotations since the first view, without signs.
     step_ns : int64
@@ -262,10 +257,9 @@ class Runs:
     period_deg: FloatArray
     stated: FloatArray
     margin: FloatArray
-    best: NDArray[np.int32]
+    named: NDArray[np.bool_]
     score: FloatArray
     outcome: NDArray[np.int8]
-    compared: NDArray[np.int8]
     travelled_deg: FloatArray
     step_ns: NDArray[np.int64]
 
@@ -274,9 +268,8 @@ class Runs:
         """Return runs without any result."""
         filled = {
             "rank": (-1, np.int32),
-            "best": (-1, np.int32),
+            "named": (False, np.bool_),
             "outcome": (-1, np.int8),
-            "compared": (-1, np.int8),
             "step_ns": (0, np.int64),
         }
         shape = (methods, objects, trials, views)

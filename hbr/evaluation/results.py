@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray
 from hbr.dense.stopping import Outcome
 from hbr.evaluation.poses import pose_rates
-from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Runs
+from hbr.evaluation.protocol import OUTCOMES, Method, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
 _BEST: int = 10  # the paper's "Best 10"
@@ -48,10 +48,9 @@ class Stopping:
 
     The paper's methods end when the margin per view reaches ``margin``; the dense filter ends by the stopping rule that
     was fitted to the enrolled views. A hit is a search that found the right object. ``unknown_rate``,
-    ``ambiguous_rate`` and ``wrong_rate`` are the shares of searches with these outcomes. ``compared_rate`` is the share
-    whose two leaders were compared pixel by pixel, ``compared_right_rate`` the share in which the comparison named the
-    right object, and ``ended_early`` the share that ended before the last view. ``pose`` has the rates of
-    `hbr.evaluation.poses.pose_rates` for the hits of the dense filter.
+    ``ambiguous_rate`` and ``wrong_rate`` are the shares of searches with these outcomes, and ``ended_early`` is the
+    share that ended before the last view. ``pose`` has the rates of `hbr.evaluation.poses.pose_rates` for the hits of
+    the dense filter.
     """
 
     margin: float
@@ -63,8 +62,6 @@ class Stopping:
     unknown_rate: float
     ambiguous_rate: float
     wrong_rate: float
-    compared_rate: float
-    compared_right_rate: float
     travelled_mean_deg: float
     ended_early: float
     pose: dict[str, float | None]
@@ -225,24 +222,18 @@ def _point(runs: Runs, method: int, n: int) -> Point:
 
 def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> Stopping:
     seen = _steps(runs, method)
-    margin, outcome, compared, rank, travelled_deg = (
+    margin, outcome, named, travelled_deg = (
         part[method][..., seen].reshape(-1, len(seen))
-        for part in (runs.margin, runs.outcome, runs.compared, runs.rank, runs.travelled_deg)
+        for part in (runs.margin, runs.outcome, runs.named, runs.travelled_deg)
     )
     # The dense search has an outcome at each view; the paper's ends by its margin.
     dense = bool((outcome >= 0).all())
     ends = outcome != OUTCOMES.index(Outcome.CONTINUE) if dense else (margin >= least_margin) & (seen + 1 >= min_views)
     end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(seen) - 1)
     trial = np.arange(len(end))
-    step = compared[trial, end]
-    # A comparison of pixels at the end replaces the ranking.
-    is_right, is_wrong = (step == COMPARED.index(one) for one in ("right", "wrong"))
-    changed = is_right | is_wrong
-    unknown, ambiguous = (
-        (outcome[trial, end] == OUTCOMES.index(one)) & ~changed for one in (Outcome.UNKNOWN, Outcome.AMBIGUOUS)
-    )
-    named = ~unknown & ~ambiguous
-    right = np.where(changed, is_right, rank[trial, end] == 1) & named
+    unknown, ambiguous = (outcome[trial, end] == OUTCOMES.index(one) for one in (Outcome.UNKNOWN, Outcome.AMBIGUOUS))
+    found = ~unknown & ~ambiguous
+    right = named[trial, end] & found
     hits = int(right.sum())
     stated = runs.stated[method][..., seen, :].reshape(-1, len(seen), 4)[trial, end][right]
     return Stopping(
@@ -253,9 +244,7 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
         *wilson(hits, len(trial)),
         float(unknown.mean()),
         float(ambiguous.mean()),
-        float((named & ~right).mean()),
-        float((step >= 0).mean()),
-        float(is_right.mean()),
+        float((found & ~right).mean()),
         float(travelled_deg[trial, end].mean()),
         float(ends[:, :-1].any(axis=1).mean()),
         pose_rates(stated[~np.isnan(stated[:, 0])]),

@@ -16,17 +16,17 @@ from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import BETA, Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
-from hbr.dense.pose import pose, poses_of
-from hbr.dense.session import DenseSession, answered, near
+from hbr.dense.pixel_fit import LocalView
+from hbr.dense.pose import azimuth_of, pose
+from hbr.dense.session import DenseSession, near
 from hbr.dense.stopping import Outcome
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition, EvaluationImage, enrolled_levels, query_levels
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.poses import stated_pose
-from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Protocol, Runs, generator, views_of_trial
+from hbr.evaluation.protocol import OUTCOMES, Method, Protocol, Runs, generator, views_of_trial
 from hbr.evaluation.results import results_of
 from hbr.model.symmetry import symmetry
 from hbr.model.views import Views
@@ -71,7 +71,7 @@ class Searched(NamedTuple):
 
 
 class LocalPhotographs:
-    """The photographs of a data set, cut out when a comparison of two leaders asks for them (`hbr.dense.session`).
+    """The photographs of a data set, cut out when a search asks for them (`hbr.dense.session`).
 
     ``seed`` is that of the queries, as for `hbr.evaluation.condition.query_levels`.
     """
@@ -93,10 +93,7 @@ class LocalPhotographs:
         return _local_view(self._condition.query(image, rng), azimuth_deg)
 
     def enrolled(self, object_index: int, numbers: IndexArray, azimuths_deg: Sequence[float]) -> list[LocalView]:
-        """Return the enrolled views nearest to each azimuth, of the photographs with these numbers, by azimuth.
-
-        There is one more than `NEAREST` for each azimuth, because a comparison leaves one out.
-        """
+        """Return the enrolled views nearest to each azimuth, of the photographs with these numbers, by azimuth."""
         own_deg = self._dataset.objects[object_index].azimuth_deg[numbers]
         return [self._enrolled(object_index, number) for number in numbers[near(own_deg, azimuths_deg)].tolist()]
 
@@ -324,13 +321,14 @@ class _Trials:
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
             objects = ranking.object_index.tolist()
-            pose_deg = [poses_of(session.belief, j)[0] if j == self._object else np.nan for j in objects]
+            pose_deg = [azimuth_of(session.belief, j) if j == self._object else np.nan for j in objects]
             self._record(ranking.object_index, np.array(pose_deg), seen, runs, (*at, n))
-            # The numbers after this view; until the first end, also its comparisons of pixels.
+            # The numbers after this view; until the first end, pixels count, too.
             runs.score[*at, n] = ranking.scores[0]
             runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
             if not ended:
-                runs.compared[*at, n] = self._compared(session, seen, measured_deg)
+                self._verify(session, seen, measured_deg)
+            runs.named[*at, n] = session.decision.object_index == self._object
             runs.outcome[*at, n] = OUTCOMES.index(session.decision.outcome)
             if not ended and session.decision.outcome is not Outcome.CONTINUE:
                 ended = True
@@ -340,11 +338,11 @@ class _Trials:
                     runs.stated[*at, n] = stated_pose(stated, float(self._azimuth_deg[newest]), enrolled_deg)
             seen.append(following)
 
-    def _compared(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> int:
-        """Compare pixels as on the bench: the leader's, and at the end those of two leaders; return `Runs.compared`."""
+    def _verify(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> None:
+        """Compare pixels as on the bench."""
         photographs = self._photographs
         if photographs is None:
-            return -1
+            return
         keep = self._keep(np.array(seen))
 
         def queries(n: int) -> list[LocalView]:
@@ -354,14 +352,7 @@ class _Trials:
             own = keep if leader == self._object else self._enrolled[self._views.of(leader)]
             return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
 
-        answered(session.verify(queries), enrolled)
-        before = session.decision.outcome
-        compared = None if before is Outcome.CONTINUE else answered(session.compare(queries), enrolled)
-        if compared is None:
-            return -1
-        if compared.winner is not None:
-            return COMPARED.index("right" if compared.winner == self._object else "wrong")
-        return COMPARED.index("none")
+        session.verify(queries, enrolled)
 
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
         match method.strategy:
@@ -443,7 +434,7 @@ class _Trials:
     ) -> None:
         place = np.flatnonzero(objects == self._object)
         runs.rank[at] = place[0] + 1 if len(place) else 0
-        runs.best[at] = objects[0]
+        runs.named[at] = objects[0] == self._object
         runs.period_deg[at] = self._period_deg
         if len(place):
             away_deg = np.abs(wrap180(pose_deg[place[0]] - self._azimuth_deg))

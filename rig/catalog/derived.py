@@ -15,7 +15,7 @@ import numpy as np
 from sqlalchemy import select
 
 import hbr
-from hbr.dense.local_difference import LocalView
+from hbr.dense.pixel_fit import LocalView
 from hbr.dense.session import near
 from hbr.descriptors import descriptor
 from hbr.kernels.library import THREADS
@@ -124,8 +124,8 @@ def views(
 def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
     """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
 
-    They are cut out as at the enrollment (`hbr.dense.local_difference`). Which these are, `hbr.dense.session.near`
-    decides for the bench and for the evaluation.
+    They are cut out as at the enrollment. Which these are, `hbr.dense.session.near` decides for the bench and for the
+    evaluation.
 
     Raises `ObjectNotFound`, `CatalogError`: there is no such object, or an image is missing or is not the stored one.
     """

@@ -83,7 +83,7 @@ def _decisions(results: Mapping[str, Any]) -> Rows:
         last, stopping = method["curve"][-1], method["stopping"]
         poses = [last[f"{kind}_error_{measure}_deg"] for kind in ("pose", "alike") for measure in ("median", "rmse")]
         poses.append(last["asymmetric_error_median_deg"])
-        rates = ("hit", "ambiguous", "unknown", "wrong", "compared", "compared_right")
+        rates = ("hit", "ambiguous", "unknown", "wrong")
         rows.append(
             [
                 method["label"],
@@ -95,7 +95,7 @@ def _decisions(results: Mapping[str, Any]) -> Rows:
                 f"{results['wall_clock']['step_median_ms'][method['name']][-1]:.1f}",
             ]
         )
-    heads = "decision|views|p95|hits %|ambiguous %|unknown %|wrong %|compared %|right by it %|rotated°|pose°|RMSE°"
+    heads = "decision|views|p95|hits %|ambiguous %|unknown %|wrong %|rotated°|pose°|RMSE°"
     return Rows([*heads.split("|"), "similar°", "RMSE°", "asym.°", "ms"], rows)
 
 
@@ -160,8 +160,8 @@ def _replaced(rows: Sequence[Row]) -> Rows:
 def _changes(rows: Sequence[Row]) -> Rows:
     """Return the shares in percent: of all objects, and of those that are reported alone."""
     heads = "change, %|objects|ranking, N = 1 / 2 / 4|decided right|wrong|ambiguous|called unknown|leader verified"
-    heads += "|leaders compared|right / wrong by it|unknown accepted|left out in turn: accepted"
-    shares = ("decided_wrong", "ambiguous", "called_unknown", "verified", "compared")
+    heads += "|unknown accepted|left out in turn: accepted"
+    shares = ("decided_wrong", "ambiguous", "called_unknown", "verified")
     return Rows(
         heads.split("|"),
         [
@@ -171,7 +171,6 @@ def _changes(rows: Sequence[Row]) -> Rows:
                 f"{' / '.join(_percent(row[f'hit_rate_{n}']) for n in (1, 2, 4))} of {row['searches']}",
                 f"{_percent(row['decided_right'])} in {row['mean_views']:.2f} views",
                 *(_percent(row[share]) for share in shares),
-                f"{_percent(row['right_by_comparison'])} / {_percent(row['wrong_by_comparison'])}",
                 f"{_percent(row['unknown_accepted'])} of {row['unknown_searches']}",
                 f"{_percent(row['left_out_accepted'])} of {row['left_out_searches']}",
             ]

@@ -12,16 +12,21 @@ from enum import StrEnum
 from functools import cache
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import ConfigDict, Discriminator, Field, TypeAdapter, ValidationError
-from pydantic_core import from_json, to_json
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Discriminator, Field, GetPydanticSchema, TypeAdapter, ValidationError
+from pydantic_core import core_schema, from_json, to_json
 
 from hbr import Outcome, StopDecision, StopReason
-from rig.events.compared import Compared, Image, Verified
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
 SCHEMA = 1
 """Version of the JSON form (docs/reference/events.md): it rises when a field is removed or changes its meaning."""
+
+NO_JSON: Final = GetPydanticSchema(lambda _kind, _handler: core_schema.any_schema())
+Image = Annotated[NDArray[np.uint8], NO_JSON, Field(exclude=True, default=np.empty((0, 0, 3), np.uint8))]
+"""The image of an event. It is no part of the JSON; an event that is read has an empty one."""
 
 
 class NoteCode(StrEnum):
@@ -270,6 +275,34 @@ class ObjectChanged:
     """Natural logarithm of how much better two objects explain the views than one object."""
     needed: float
     """Evidence from which the search begins again; it is higher if the views before fit no enrolled object closely."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """The enrolled views of the leading candidates were compared with the views so far, pixel by pixel.
+
+    A replay does not repeat this comparison: it uses the saved ``fit``, ``second``, ``others`` and ``expected``.
+    """
+
+    event: Literal["verified"] = field(default="verified", init=False)
+    index: int
+    """Index of the last view, from 0."""
+    name: str
+    """Name of the leading candidate."""
+    fit: float
+    """Share of the views' contrast that the enrolled views of this candidate explain, at most 1."""
+    second: float
+    """The same share for the other one of the two likeliest candidates, at most 1; 0 without one."""
+    others: float
+    """The best of these shares for the next candidates that are no near twins of this one, at most 1; 0 without one."""
+    expected: float
+    """Share of the contrast that two neighbouring enrolled views of this candidate explain of each other, at most 1."""
+    outcome: Outcome
+    """Decision after the comparison: ``continue``, ``found``, ``ambiguous`` or ``unknown``."""
+    probability: float
+    """Probability of this candidate after the comparison."""
+    not_enrolled: float
+    """Probability that the object on the table is not enrolled, after the comparison."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -562,7 +595,6 @@ Event = (
     | FrameUsed
     | ObjectChanged
     | Verified
-    | Compared
     | Decided
     | Enrolled
     | Identified

@@ -14,7 +14,6 @@ from rig.core.phrases import (
     sentence,
     signed,
 )
-from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
     Candidate,
@@ -36,6 +35,7 @@ from rig.events.events import (
     SkipReason,
     Started,
     Unwinding,
+    Verified,
     Waiting,
     Warned,
 )
@@ -43,7 +43,6 @@ from rig.events.wording import (
     NOT_ENROLLED,
     answer_lines,
     change_words,
-    comparison_words,
     decision_words,
     move_words,
     note_steps,
@@ -139,8 +138,6 @@ def page_line(event: Event) -> str:
             return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
         case Verified():
             return f"  {sentence(verification_words(event))}"
-        case Compared():
-            return f"  {sentence(comparison_words(event))}"
         case Identified():
             least = "" if event.min_score is None else f" (unknown below {event.min_score:.3f})"
             numbers = (

@@ -16,7 +16,6 @@ from rig.core.phrases import (
     sentence,
     signed,
 )
-from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Candidate,
     Decided,
@@ -31,6 +30,7 @@ from rig.events.events import (
     SimilarObject,
     SimilarObjects,
     Unwinding,
+    Verified,
     WaitReason,
 )
 from rig.motion.scan_speed import SpeedLimit
@@ -136,19 +136,6 @@ def change_words(change: ObjectChanged) -> str:
     )
 
 
-def comparison_words(compared: Compared) -> str:
-    """Return what the comparison of two candidates found, as a sentence without its full stop."""
-    first, second = compared.names
-    begin = f"compared with {first} and {second} pixel by pixel where they differ most"
-    if compared.winner is not None:
-        bound = percent_words(compared.error_bound)
-        score = signed(compared.score, 2)
-        return f"{begin}: it is {compared.winner}, with an error rate of at most {bound} (score {score})"
-    if not compared.views:
-        return f"{begin}: their enrolled views show no difference from these sides"
-    return f"{begin}: the difference does not tell which one it is (score {signed(compared.score, 2)})"
-
-
 def reason_words(answer: Identified) -> str:
     """Return why a search ended."""
     match answer.reason:
@@ -156,10 +143,6 @@ def reason_words(answer: Identified) -> str:
             return f"the margin {answer.margin:.3f} per view reaches {answer.min_margin:g}"
         case StopReason.NO_ROTATION_LEFT:
             return "the cable allows no other view"
-        case StopReason.LOCAL_DIFFERENCE if answer.outcome is Outcome.FOUND:
-            return "the leading candidates were compared pixel by pixel where they differ most"
-        case StopReason.LOCAL_DIFFERENCE:
-            return "the views fit two enrolled objects up to noise, and do not tell which one it is"
         case StopReason.CUSTOM:
             return answer.note
         case StopReason.MAX_VIEWS if answer.not_enrolled is None:

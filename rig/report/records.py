@@ -13,7 +13,6 @@ from hbr import Outcome
 from hbr.core.angles import wrap180
 from rig.catalog import View
 from rig.charts.compass import PathStep
-from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
     Decided,
@@ -27,6 +26,7 @@ from rig.events.events import (
     Rejected,
     SimilarObjects,
     Started,
+    Verified,
     event_of,
 )
 from rig.report.pictures import Image, Region, thumbnail
@@ -172,7 +172,6 @@ class IdentificationRecord(_Record):
         self.used: list[FrameUsed] = []
         self.decided: list[Decided] = []
         self.verified: Verified | None = None
-        self.compared: Compared | None = None
         self.answer: Identified | None = None
 
     def add(self, event: Event) -> None:
@@ -186,8 +185,6 @@ class IdentificationRecord(_Record):
                 self.used.append(event)
             case Verified():
                 self.verified = event
-            case Compared():
-                self.compared = event
             case Decided():
                 self.decided.append(event)
             case Identified():

@@ -24,7 +24,6 @@ from rig.events.events import Decided
 from rig.events.wording import (
     NOT_ENROLLED,
     answer_words,
-    comparison_words,
     decision_words,
     move_words,
     note_steps,
@@ -158,7 +157,7 @@ Shown = dict[str, Any]
 
 
 def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unfold: bool) -> Shown:
-    answer, views, compared = record.answer, record.views, record.compared
+    answer, views = record.answer, record.views
     error_deg = record.pose_error_deg
     shown = record.shown
     path = candidates = Markup()
@@ -195,7 +194,6 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
         candidates=candidates,
         motion=_motion_words(record),
         notes=[f"{sentence(note_words(note))} {in_words(note_steps(note))}" for note in record.notes],
-        differs="" if compared is None or compared.picture_bgr is None else data_uri(compared.picture_bgr),
         frames=[_frame(record, view, styles) for view in shown],
         hidden=len(views) - len(shown),
         unfold=unfold or record.correctness is Correctness.WRONG,
@@ -251,7 +249,6 @@ def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> Sh
     words = [ranking_words(thought)]
     if view is record.views[-1]:
         words += [verification_words(record.verified)] if record.verified else []
-        words += [comparison_words(record.compared)] if record.compared else []
     return Shown(
         number=view.index + 1,
         picture=data_uri(view.picture_bgr),

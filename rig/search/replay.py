@@ -5,10 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
-from hbr.dense.local_difference import PixelFit
-from hbr.dense.session import answered
 from rig.core.json_form import plain
-from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
     Decided,
@@ -18,11 +15,12 @@ from rig.events.events import (
     Moved,
     ObjectChanged,
     Ranked,
+    Verified,
     event_dict,
 )
 from rig.search.model import begin_search
 from rig.search.saved_run import SavedRun
-from rig.search.session import Search, saved_enrolled_views
+from rig.search.session import Search
 from rig.search.strategies import Finish
 from rig.views.description import SearchDescriber
 
@@ -107,13 +105,7 @@ def check(run: SavedRun) -> ReplayCheck:
                 found.decisions += 1
                 computed = _decided(search, event)
             case Verified():
-                # the enrolled images are not in the run, so their measured fit is used
-                leader = search.names.index(event.name)
-                measured = PixelFit(leader, event.fit, event.second, event.others, event.expected)
-                computed = answered(search.verify((), measured))
-            case Compared():
-                views = saved_enrolled_views(event, search.names)
-                computed = answered(search.compare(describe.hypotheses), views) or {}
+                computed = search.verified_before(event)
             case Identified():
                 found.decisions += 1
                 answer = search.answer(travelled_deg=event.travelled_deg, seconds=event.seconds)

@@ -3,7 +3,6 @@
 ``run.json`` contains the conditions and settings, ``model.jsonl`` the enrolled views (one object in each line),
 ``events.jsonl`` the events (one in each line), ``frames/000.png``, ... the accepted frames without loss. The folder of
 a dense search also contains the empty-table image (``empty_table.png``).
-``leaders/`` has the enrolled views of two candidates that were compared pixel by pixel, as crop and mask.
 
 Decision: docs/decisions/0017.
 """
@@ -30,7 +29,6 @@ from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.core.next_steps import Do
-from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
 from rig.search.model import Model, empty_table_for, model_of
 from rig.views import image_files as images
@@ -38,8 +36,6 @@ from rig.views import image_files as images
 FORMAT: Final = "hbr-rig run"
 VERSION: Final = 1  # a run of another version is not checked, because its decisions come from another program
 EMPTY_TABLE: Final = "empty_table.png"
-LEADERS: Final = "leaders"
-DIFFERS_HERE: Final = f"{LEADERS}/differs_here.png"
 
 MAX_FRAME_PIXELS: Final = 64_000_000
 """8000 x 8000, the largest frame of the configuration."""
@@ -105,9 +101,8 @@ class RunWriter:
         Raises `UsageError`: the disk is full or fails.
         """
         with _writing(self._folder):
-            for name, image in _images_of(event):
-                (self._folder / name).parent.mkdir(exist_ok=True)
-                write(self._folder / name, images.encode(image))
+            if isinstance(event, Accepted):
+                write(self._folder / _frame_file(event.index), images.encode(event.image_bgr))
             self._line(event_dict(event))
 
     def _line(self, value: dict[str, Any]) -> None:
@@ -180,7 +175,9 @@ class SavedRun:
         """
         for number, line in enumerate(self._lines, 1):
             try:
-                event = self._with_images(event_of(line))
+                event = event_of(line)
+                if isinstance(event, Accepted):
+                    event = replace(event, image_bgr=self._frame(event.index))
             except _DAMAGE as error:
                 raise _damaged(self.folder, f"events.jsonl, line {number}: {_reason(error)}") from error
             yield event
@@ -205,18 +202,6 @@ class SavedRun:
         if not isinstance(first, Started):
             raise _damaged(self.folder, "events.jsonl does not begin with the event started")
         return first
-
-    def _with_images(self, event: Event) -> Event:
-        if isinstance(event, Accepted):
-            return replace(event, image_bgr=self._frame(event.index))
-        if not isinstance(event, Compared):
-            return event
-        picture = _image(self.folder, DIFFERS_HERE) if event.views else None
-        leaders = tuple(
-            tuple(_image(self.folder, _leader_file(side, number)) for number in range(len(azimuths_deg)))
-            for side, azimuths_deg in enumerate(event.azimuths_deg)
-        )
-        return replace(event, picture_bgr=picture, leaders=leaders)
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
         frame = _image(self.folder, _frame_file(index))
@@ -268,23 +253,6 @@ def load_run(folder: Path) -> SavedRun:
 def _frame_file(index: int) -> str:
     """Return the file of the frame of an accepted view."""
     return f"frames/{index:03d}.png"
-
-
-def _leader_file(side: int, number: int) -> str:
-    """Return the file of an enrolled view of the first (0) or second (1) leader that were compared."""
-    return f"{LEADERS}/{side}-{number:03d}.png"
-
-
-def _images_of(event: Event) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """Yield the images of an event, with their files."""
-    if isinstance(event, Accepted):
-        yield _frame_file(event.index), event.image_bgr
-    elif isinstance(event, Compared):
-        if event.picture_bgr is not None:
-            yield DIFFERS_HERE, event.picture_bgr
-        for side, own in enumerate(event.leaders):
-            for number, image in enumerate(own):
-                yield _leader_file(side, number), image
 
 
 def _model_lines(views: hbr.Views) -> Iterator[str]:

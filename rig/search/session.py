@@ -1,32 +1,30 @@
 """A search without its hardware: views in, ranking and decision out.
 
-A search does no I/O. It takes a view (`Search.add`), asks for enrolled views to compare it with (`Search.verify`), and
-says what it needs next (`Search.decide`): a view after a rotation, or the end. After the last view, it may compare its
-two leaders (`Search.compare`), and answers (`Search.answer`). The bench at rest and in motion (`rig.plans.identify`)
-and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
+A search does no I/O. It takes a view (`Search.add`), compares it with enrolled views that the driver brings
+(`Search.verify`), and says what it needs next (`Search.decide`): a view after a rotation, or the end. Then it answers
+(`Search.answer`). The bench at rest and in motion (`rig.plans.identify`) and the replay (`rig.search.replay`) drive it;
+`rig eval` drives the same `hbr.DenseSession`.
 
 Decision: docs/decisions/0017.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 import hbr
 from hbr.core.angles import wrap360
 from hbr.dense.arc import ArcSession
-from hbr.dense.local_difference import LocalView, PixelFit, ViewDifference
-from hbr.dense.pose import pose, poses_of
-from hbr.dense.session import Asking, LeaderComparison, Queries
+from hbr.dense.pixel_fit import LocalView, PixelFit
+from hbr.dense.pose import azimuth_of, pose
+from hbr.dense.session import EnrolledViews
 from hbr.model.symmetry import symmetry
 from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from rig.config import RigConfig
-from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import (
     Candidate,
     Decided,
@@ -40,6 +38,7 @@ from rig.events.events import (
     Ranked,
     Rejected,
     RotationReason,
+    Verified,
 )
 from rig.search.strategies import (
     DenseSearchState,
@@ -53,94 +52,6 @@ from rig.search.strategies import (
 )
 from rig.views.capture import RejectReason
 from rig.views.description import DescribedView
-
-SHOWN_VIEWS: Final = 3  # the most telling ones; more make the page of a report longer
-TILE_PX: Final = 160
-
-EnrolledViews = Callable[[str, Sequence[float]], Sequence[LocalView]]
-"""Returns the enrolled views of an object near some azimuths."""
-
-
-def compared_event(index: int, comparison: LeaderComparison, names: tuple[str, ...], left_out: int = 0) -> Compared:
-    """Return the event of a comparison after the last view; ``names`` are those of the enrolled objects.
-
-    ``left_out`` is the number of views that the comparison does not know, because the object changed after them.
-    """
-    found = comparison.found
-    first, second = comparison.leaders
-    views = [(left_out + comparison.compared[one.view], one) for one in found.views]
-    return Compared(
-        index=index,
-        names=(names[first], names[second]),
-        winner=None if found.winner is None else names[comparison.leaders[found.winner]],
-        score=found.score,
-        expected=found.expected,
-        error_bound=found.error_bound,
-        max_error=comparison.max_error,
-        unexplained=found.unexplained,
-        misfit=found.misfit,
-        apart=found.apart,
-        views=tuple(ComparedView(number, one.score, one.weight) for number, one in views),
-        azimuths_deg=(_azimuths(comparison.views[0]), _azimuths(comparison.views[1])),
-        picture_bgr=_picture(found.views),
-        leaders=(_pixels(comparison.views[0]), _pixels(comparison.views[1])),
-    )
-
-
-def saved_enrolled_views(
-    event: Compared, names: Sequence[str]
-) -> Callable[[int, Sequence[float]], Sequence[LocalView]]:
-    """Return what brings the enrolled views of a saved comparison, by the index of the object's name."""
-
-    def views(object_index: int, _: Sequence[float]) -> list[LocalView]:
-        side = event.names.index(names[object_index])
-        pairs = zip(event.leaders[side], event.azimuths_deg[side], strict=True)
-        return [LocalView(*_parts(image), azimuth_deg) for image, azimuth_deg in pairs]
-
-    return views
-
-
-def _azimuths(views: Sequence[LocalView]) -> tuple[float, ...]:
-    return tuple(view.azimuth_deg for view in views)
-
-
-def _pixels(views: Sequence[LocalView]) -> tuple[NDArray[np.uint8], ...]:
-    """Return crop and mask side by side, to be stored as an image, uint8 (160, 320, 3)."""
-    return tuple(np.hstack([view.crop, np.repeat(view.mask[:, :, None], 3, axis=2)]) for view in views)
-
-
-def _parts(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    side = image.shape[1] // 2
-    if image.shape[1] != 2 * image.shape[0]:
-        raise ValueError("the enrolled view of a comparison has another shape")
-    return image[:, :side], np.ascontiguousarray(image[:, side:, 0])
-
-
-def _picture(views: Sequence[ViewDifference]) -> NDArray[np.uint8] | None:
-    """Return a row for each of the clearest views: the view, both enrolled views, and where these differ; or None."""
-    if not views:
-        return None
-    size = (TILE_PX, TILE_PX)
-    rows = []
-    for one in views[:SHOWN_VIEWS]:
-        tiles = [cv2.resize(tile, size, interpolation=cv2.INTER_CUBIC) for tile in (one.query, one.first, one.second)]
-        rows.append(np.hstack([*tiles, _marked(tiles[0], cv2.resize(one.difference, size))]))
-    return np.vstack(rows).astype(np.uint8, copy=False)
-
-
-def _marked(view: NDArray[Any], difference: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return a view in grey, red where the enrolled views differ, with a frame around the largest part."""
-    grey = cv2.cvtColor(cv2.cvtColor(view, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR).astype(np.float32) * 0.6
-    share = np.clip(difference / max(float(difference.max()), 1.0), 0, 1)[:, :, None]
-    marked: NDArray[np.uint8] = (grey * (1 - share) + np.array([40.0, 40.0, 255.0], np.float32) * share).astype(
-        np.uint8
-    )
-    _, _, stats, _ = cv2.connectedComponentsWithStats((share[:, :, 0] > 0.25).astype(np.uint8))
-    if len(stats) > 1:
-        x, y, w, h, _ = stats[1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())].tolist()
-        cv2.rectangle(marked, (x - 4, y - 4), (x + w + 3, y + h + 3), (60, 220, 255), 1, cv2.LINE_AA)
-    return marked
-
 
 SHOWN: Final = 5
 """Candidates that an event names by default."""
@@ -208,6 +119,10 @@ class Search(ABC):
         assert self.step is not None
         return self.ranked, self.step
 
+    def verified_before(self, saved: Verified) -> Verified | None:  # noqa: ARG002
+        """Use the fit of a saved event instead of enrolled views, which a saved run does not have."""
+        return None
+
     @abstractmethod
     def _add(self, view: DescribedView) -> None: ...
 
@@ -242,16 +157,12 @@ class Search(ABC):
         """Return the event if the last view shows that the object changed; the search has then begun again."""
         return None
 
-    def verify(self, hypotheses: Hypotheses, measured: PixelFit | None = None) -> Asking[Verified | None]:  # noqa: ARG002
+    def verify(self, hypotheses: Hypotheses, enrolled: EnrolledViews) -> Verified | None:  # noqa: ARG002
         """Compare the last views with the leader's, as `hbr.DenseSession.verify`; the decision depends on it."""
-        return _no_step()
-
-    def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:  # noqa: ARG002
-        """Compare the two leaders, as `hbr.DenseSession.compare`; the answer depends on it."""
-        return _no_step()
+        return None
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        """Return the answer after the last view, and after the comparison if there was one."""
+        """Return the answer after the last view."""
         self.decide()
         best = self.ranked.candidates[0]
         end = self.step if isinstance(self.step, Finish) else Finish(hbr.StopReason.MAX_VIEWS)
@@ -271,10 +182,6 @@ class Search(ABC):
             possible=(best.name,),
             note=end.note,
         )
-
-
-def _no_step() -> Asking[None]:
-    yield from ()
 
 
 def _min_score(views: hbr.Views, config: RigConfig) -> float:
@@ -473,7 +380,7 @@ class DenseSearch(Search):
         found = []
         for place in self._order[: self._top].tolist():
             one = int(belief.index.object_index[place])
-            numbers = float(self._scores[place]), poses_of(belief, one)[0], float(probability[place])
+            numbers = float(self._scores[place]), azimuth_of(belief, one), float(probability[place])
             found.append(Candidate(self.names[one], *numbers))
         return tuple(found)
 
@@ -506,8 +413,19 @@ class DenseSearch(Search):
             rng=self._rng,
         )
 
-    def verify(self, hypotheses: Hypotheses, measured: PixelFit | None = None) -> Asking[Verified | None]:
-        found = yield from self._session.verify(self._queries(hypotheses), measured)
+    def verify(self, hypotheses: Hypotheses, enrolled: EnrolledViews) -> Verified | None:
+        own, orientations_deg = hypotheses[self._session.left_out :], self._orientations[self._session.left_out :]
+
+        def queries(n: int) -> list[LocalView]:
+            return [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
+
+        return self._verified(self._session.verify(queries, enrolled))
+
+    def verified_before(self, saved: Verified) -> Verified | None:
+        own = self.names.index(saved.name), saved.fit, saved.second, saved.others, saved.expected
+        return self._verified(self._session.use(PixelFit(*own)))
+
+    def _verified(self, found: PixelFit | None) -> Verified | None:
         if found is None:
             return None
         decision = self._session.decision
@@ -523,31 +441,19 @@ class DenseSearch(Search):
             not_enrolled=decision.not_enrolled,
         )
 
-    def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:
-        found = yield from self._session.compare(self._queries(hypotheses))
-        if found is None:
-            return None
-        return compared_event(len(self._orientations) - 1, found, self.names, self._session.left_out)
-
-    def _queries(self, hypotheses: Hypotheses) -> Queries:
-        own, orientations_deg = hypotheses[self._session.left_out :], self._orientations[self._session.left_out :]
-        return lambda n: [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
-
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
         decision = self._session.end()
         outcome = decision.outcome
-        compared = decision.reason is hbr.StopReason.LOCAL_DIFFERENCE
-        possible = self._leaders() if compared else self._possible(decision)
+        possible = self._possible(decision)
         found = pose(self._session.belief, decision.object_index)
         yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
         return replace(
             answer,
-            name=None if outcome is hbr.Outcome.UNKNOWN else possible[0] if compared else answer.name,
+            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
             views=self._session.belief.queries,
             left_out=tuple(LeftOut(n, LeftOutReason.OBJECT_CHANGED) for n in range(self._session.left_out)),
             outcome=outcome,
-            reason=decision.reason if compared else answer.reason,
             possible=possible,
             yaw_deg=yaws_deg[0] if len(yaws_deg) == 1 else None,
             yaw_sigma_deg=found.sigma_deg,
@@ -557,12 +463,6 @@ class DenseSearch(Search):
             min_confidence=decision.min_confidence,
             not_enrolled=decision.not_enrolled,
         )
-
-    def _leaders(self) -> tuple[str, ...]:
-        """Return the objects that the comparison of the two leaders leaves possible."""
-        found = self._session.comparison
-        assert found is not None
-        return tuple(self.names[one] for one in (found.leaders if found.winner is None else (found.winner,)))
 
     def _possible(self, decision: hbr.StopDecision) -> tuple[str, ...]:
         """Return the possible objects: of an ambiguous one at least the likeliest two.

@@ -7,7 +7,7 @@ from hbr import DenseIndex, DenseSession, Outcome, Views
 from hbr.core.angles import wrap180
 from hbr.dense.arc import STEP_DEG, ArcSession
 from hbr.dense.change import CHANGED_FROM, CHANGED_FROM_KNOWN, DISTURBED, MORE_PER_VIEW, changed
-from hbr.dense.pose import poses_of
+from hbr.dense.pose import azimuth_of
 from tests.hbr.dense.searches import belief_after, catalog, found_from, view
 
 ANGLES_DEG = (0.0, 100.0, 220.0, 300.0)
@@ -46,7 +46,7 @@ def test_search_begins_again_if_the_object_was_rotated_by_hand(index: DenseIndex
     index = DenseIndex(index.views, omega=60.0)  # the azimuths of the views count much
     session = DenseSession(index)
     assert changes(session, index.views, [(3, 0.0), (3, 0.0), (3, 140.0)]) == [None, None, 2]
-    assert wrap180(poses_of(session.belief, 3)[0] - ANGLES_DEG[2] - 140.0) == pytest.approx(0.0, abs=5.0)
+    assert wrap180(azimuth_of(session.belief, 3) - ANGLES_DEG[2] - 140.0) == pytest.approx(0.0, abs=5.0)
 
 
 def test_search_for_one_object_never_begins_again(index: DenseIndex) -> None:

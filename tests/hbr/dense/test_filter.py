@@ -12,7 +12,7 @@ from hbr import DenseIndex, Views, update_belief
 from hbr.core.angles import size_deg
 from hbr.dense.filter import BETA, Belief
 from hbr.dense.index import BINS, OMEGA
-from hbr.dense.pose import poses_of
+from hbr.dense.pose import azimuth_of
 from hbr.kernels import without_library
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import belief_after
@@ -132,7 +132,7 @@ def test_rotated_queries_agree_on_an_azimuth_between_the_bins() -> None:
     belief = belief_after(views.descriptors[rows[[1, 3, 6]]], [10.0, 100.0, 235.0], DenseIndex(views))
     ranking = belief.ranking()
     assert ranking.object_index[0] == 2
-    assert abs((poses_of(belief, 2)[0] - views.azimuth_deg[rows[6]] + 180) % 360 - 180) < 2.5
+    assert abs((azimuth_of(belief, 2) - views.azimuth_deg[rows[6]] + 180) % 360 - 180) < 2.5
 
 
 def test_another_zero_of_the_orientations_changes_nothing() -> None:

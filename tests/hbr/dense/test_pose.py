@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, update_belief
 from hbr.core.angles import wrap180
-from hbr.dense.pose import Pose, pose, pose_of, poses_of
+from hbr.dense.pose import Pose, azimuth_of, pose, pose_of
 from tests.hbr.dense.searches import belief_after, catalog
 
 AZIMUTHS_DEG = np.arange(360.0)
@@ -94,7 +94,7 @@ def test_azimuths_between_enrolled_views_are_estimated(step_deg: float, share: f
     found = pose(belief, 0)
     assert found.sigma_deg is not None
     assert abs(found.azimuth_deg[0] - true_deg) < min(0.1 * step_deg, 2 * found.sigma_deg + 0.5)
-    assert poses_of(belief, 0)[0] == found.azimuth_deg[0]
+    assert azimuth_of(belief, 0) == found.azimuth_deg[0]
 
 
 def test_a_changed_bench_makes_a_pose_less_certain() -> None:

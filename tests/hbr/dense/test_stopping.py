@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Belief, DenseIndex, Outcome, StopReason
-from hbr.dense.local_difference import PixelFit
+from hbr.dense.pixel_fit import PixelFit
 from hbr.dense.stopping import LAST_CONFIDENCE, MIN_CONFIDENCE, UNKNOWN_FROM, among_enrolled, decide, posterior
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import LIGHT, belief_after, catalog, view

@@ -30,22 +30,8 @@ def test_shares_of_enrolled_objects_and_of_others_are_counted() -> None:
     assert (found["searches"], found["unknown_searches"], found["left_out_searches"]) == (4, 2, 4)
     assert (found["hit_rate_1"], found["hit_rate_4"]) == (0.75, 0.75)
     assert (found["decided_right"], found["decided_wrong"], found["called_unknown"]) == (0.25, 0.25, 0.25)
-    assert (found["ambiguous"], found["compared"]) == (0.25, 0.0)
+    assert found["ambiguous"] == 0.25
     assert (found["mean_views"], found["unknown_accepted"], found["left_out_accepted"]) == (2.0, 0.5, 0.25)
-
-
-def test_answers_of_the_comparison_count_as_decided() -> None:
-    known = {
-        "a": [
-            SearchResult(("b",) * 4, hbr.Outcome.FOUND, "a", 4, compared=True, by_comparison=True),
-            SearchResult(("a",) * 4, hbr.Outcome.FOUND, "b", 4, compared=True, by_comparison=True),
-            SearchResult(("a",) * 4, hbr.Outcome.AMBIGUOUS, "a", 4, compared=True),
-            result("a", hbr.Outcome.FOUND),
-        ]
-    }
-    found = summary(known, {})
-    assert (found["compared"], found["decided_right"], found["decided_wrong"]) == (0.75, 0.5, 0.25)
-    assert (found["right_by_comparison"], found["wrong_by_comparison"]) == (0.25, 0.25)
 
 
 def test_stated_probabilities_are_compared_with_the_shares_of_right_answers() -> None:

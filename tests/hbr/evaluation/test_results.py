@@ -12,6 +12,7 @@ def runs_of(rank: list, **arrays: list) -> Runs:
     ranks = np.array(rank, np.int32)[:, :, None]
     runs = Runs.blank(*ranks.shape)
     runs.rank[:] = ranks
+    runs.named[:] = ranks == 1
     for name, values in arrays.items():
         getattr(runs, name)[:] = np.array(values)[:, :, None]
     return runs

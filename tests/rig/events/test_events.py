@@ -13,7 +13,6 @@ from hbr.dense import stopping
 from rig.catalog import Catalog, derived
 from rig.core.errors import ViewRejected
 from rig.devices.camera import CameraLocks
-from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import (
     SCHEMA,
     Candidate,
@@ -29,6 +28,7 @@ from rig.events.events import (
     ScanStarted,
     SimilarObject,
     Unwinding,
+    Verified,
     Waiting,
     WaitReason,
     Warned,
@@ -47,11 +47,10 @@ from rig.views.capture import MotionEvidence, ViewEvidence
 
 TEXT = events_page()
 KINDS = {next(f.default for f in fields(kind) if f.name == "event"): kind for kind in get_args(Event)}
-NOT_IN_TABLES = {"event", "image_bgr", "picture_bgr", "leaders"}
+NOT_IN_TABLES = {"event", "image_bgr"}
 PLAIN = {"string": str, "integer": int, "number": (int, float), "boolean": bool, "object": dict}
 PARTS = {
     "candidate": Candidate,
-    "compared_view": ComparedView,
     "similar_object": SimilarObject,
     "weighed": Weighed,
     "left_out": LeftOut,
@@ -160,9 +159,6 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path, m
     seen.add(check_event(Warned(3, Note(NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}))))
     seen.add(check_event(FrameUsed(3, 30.0, 1.0, 0, "dice", 0.5, hbr.Outcome.CONTINUE)))
     seen.add(check_event(ScanStarted(90.0, SpeedLimit.SMEAR, 10.0, 0.0, 360.0)))
-    sides = ((0.0,), (10.0, 20.0))
-    shown = (ComparedView(2, 0.9, 5000.0),)
-    seen.add(check_event(Compared(3, ("a", "b"), "a", 0.9, (1.0, -1.0), 0.01, 0.01, 0.1, 0.2, 1.5, shown, sides)))
     decision = StopDecision(hbr.Outcome.FOUND, hbr.StopReason.CONFIDENT, 0, 0.99, 0.004, 0.97)
     seen.add(check_event(Ranked(3, (Candidate("dice", 0.9, 30.0, 0.99),), 0.2, decision)))
     seen.add(check_event(ObjectChanged(3, 2, 7.5, 3.0)))

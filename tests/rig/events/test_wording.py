@@ -6,7 +6,6 @@ import pytest
 
 from hbr import Outcome, StopDecision, StopReason
 from rig.core.next_steps import Do, steps_as_json
-from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import (
     Candidate,
     Decided,
@@ -19,13 +18,13 @@ from rig.events.events import (
     RotationReason,
     SimilarObject,
     SimilarObjects,
+    Verified,
     WaitReason,
     Weighed,
 )
 from rig.events.lines import line
 from rig.events.wording import (
     answer_words,
-    comparison_words,
     decision_words,
     move_words,
     note_steps,
@@ -169,15 +168,6 @@ def test_verification_is_put_into_words() -> None:
     )
     assert words in verification_words(found)
     assert line(found).endswith("it is mug with 99.0 %, and not enrolled with 0.5 %.")
-
-
-def test_comparison_is_put_into_words() -> None:
-    views = (ComparedView(3, -0.9, 5000.0),)
-    found = Compared(4, ("a", "b"), "b", -0.9, (0.9, -0.9), 0.004, 0.01, 0.1, 0.2, 1.5, views, ((0.0,), (10.0,)))
-    assert comparison_words(found).endswith("it is b, with an error rate of at most 0.4 % (score −0.90)")
-    assert "does not tell" in comparison_words(replace(found, winner=None))
-    assert "show no difference" in comparison_words(replace(found, winner=None, views=()))
-    assert line(found).startswith("  Compared with a and b")
 
 
 def test_similar_objects_are_put_into_words() -> None:

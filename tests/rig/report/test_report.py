@@ -14,7 +14,6 @@ import pytest
 from hbr import Outcome
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
-from rig.events.compared import Compared, ComparedView
 from rig.events.events import Accepted
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
 from tests.rig.report.report_samples import NAMES, enrolled, enrolling, identified, identifying, searching_densely
@@ -304,23 +303,6 @@ def test_dense_search_shows_its_decisions(pair: bool) -> None:
     labels = [attributes["aria-label"] for attributes in page.all("svg")]
     assert sum(reason in label for label in labels) == 2, "the chart says what its card says"
     assert ["mug-white", "60.0 %", "0.900"] in [row for table in page.tables for row in table]
-
-
-def test_comparison_of_two_candidates_is_shown_with_its_picture() -> None:
-    views = (ComparedView(1, 0.9, 5000.0),)
-    picture = np.full((160, 640, 3), 90, np.uint8)
-    names, azimuths_deg = (NAMES[0], NAMES[1]), ((0.0,), (10.0,))
-    compared = Compared(2, names, NAMES[0], 0.9, (0.9, -0.9), 0.004, 0.01, 0.1, 0.2, 1.5, views, azimuths_deg, picture)
-    for event, pictures in ((compared, 1), (replace(compared, picture_bgr=None, views=(), winner=None), 0)):
-        record = IdentificationRecord()
-        for one in (*searching_densely(), event):
-            record.add(one)
-        page = Page(render_report("t", "s", [], [record], meta=META))
-        alt = "Views in which the two candidates differ"
-        assert [attrs["alt"] for tag, attrs in page.tags if tag == "img"].count(alt) == pictures
-        text = " ".join(page.texts)
-        assert text.count(f"Compared with {NAMES[0]} and {NAMES[1]} pixel by pixel") == 1
-        assert ("the differences in red" in text) == bool(pictures)
 
 
 def test_long_search_shows_a_dozen_views_with_its_first_and_last() -> None:

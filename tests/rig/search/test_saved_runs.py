@@ -16,7 +16,6 @@ import hbr
 from hbr.dense import stopping
 from rig.cli.main import app
 from rig.core.errors import UsageError
-from rig.events.compared import Compared
 from rig.events.events import (
     Accepted,
     Decided,
@@ -38,7 +37,7 @@ from tests.rig.search.run_samples import saved_runs
 def saved(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for least in ("MIN_CONFIDENCE", "LAST_CONFIDENCE"):
-            patch.setattr(stopping, least, 1.0)  # no search is sure, so that its two leaders are compared
+            patch.setattr(stopping, least, 1.0)  # no search is sure
         yield saved_runs(tmp_path_factory.mktemp("runs"))
 
 
@@ -90,23 +89,9 @@ def test_dense_search_is_computed_again_from_its_folder(saved, tmp_path):
     assert all(e.segmentation["agreement"] > 0.9 for e in events if isinstance(e, Accepted))
     again = list(run.events())
     assert [event_dict(event) for event in again] == [event_dict(event) for event in events]
-    (compared,) = (event for event in events if isinstance(event, Compared))
-    (read,) = (event for event in again if isinstance(event, Compared))
-    assert set(compared.names) == {"mug-white", "mug-star"}
-    assert [len(own) for own in read.leaders] == [len(own) for own in compared.azimuths_deg]
-    assert (read.leaders[1][0] == compared.leaders[1][0]).all()
-    for missing, words in (
-        ("empty_table.png", "segmentation.agreement"),
-        ("leaders/1-000.png", None),
-    ):
-        other = tmp_path / missing.replace("/", "-")
-        shutil.copytree(folder, other)
-        (other / missing).unlink()
-        if words is None:
-            with pytest.raises(UsageError, match="cannot be read"):
-                check(load_run(other))
-        else:
-            assert words in {difference.what for difference in check(load_run(other)).differences}
+    other = shutil.copytree(folder, tmp_path / "without")
+    (other / "empty_table.png").unlink()
+    assert "segmentation.agreement" in {difference.what for difference in check(load_run(other)).differences}
 
 
 def test_replay_reports_a_changed_frame(saved, tmp_path):
