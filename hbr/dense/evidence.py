@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, IndexArray
 from hbr.dense.filter import Belief
-from hbr.dense.index import BIN_DEG
+from hbr.dense.index import BIN_DEG, DenseIndex
 from hbr.dense.space import Floats
 
 #: Candidates that the leader is compared with.
@@ -26,7 +26,7 @@ _COHORT: Final = 10  # more: less noise, and less similar objects, whose similar
 _NEXT: Final = 3
 
 #: The number of numbers that do not depend on the parts of the descriptor; they come first.
-COMMON: Final = 7
+COMMON: Final = 8
 #: No search had enrolled views nearer to each other, or more queries, when the weights were fitted.
 _LEAST_APART_DEG: Final = 10.0
 _MOST_QUERIES: Final = 4.0
@@ -38,7 +38,7 @@ _LEAST_LEAD: Final = 0.5
 
 
 def numbers(belief: Belief, leader: int) -> FloatArray:
-    """Return the numbers for the object at a place of the belief's index, float64 (7 + 2 p,), of p uses of parts.
+    """Return the numbers for the object at a place of the belief's index, float64 (8 + 2 p,), of p uses of parts.
 
     A lead is by how much z exceeds the mean z of a cohort, the next candidates; it is a mean over the queries, by their
     weights. The numbers are:
@@ -47,6 +47,8 @@ def numbers(belief: Belief, leader: int) -> FloatArray:
     - the lead, relative to the lead that the two enrolled views beside the estimated azimuth have among each other,
     - the logarithms of the lead that is expected of a view between these two, and of the same over the best of the
       cohort instead of its mean: how different the leader is from the cohort,
+    - the lead of the leader's least familiar side, relative to the same as the third number: how much the enrolled view
+      that resembles those at the estimated poses least resembles them. An object that is not enrolled may differ there,
     - the logarithms of the mean distance of the leader's enrolled views in degrees, and of the number of queries,
     - the lead of each use of a part, and its z.
 
@@ -77,8 +79,15 @@ def numbers(belief: Belief, leader: int) -> FloatArray:
     )
     apart_deg = max(360 / len(index.rows_of(leader)), _LEAST_APART_DEG)
     queries = min(max(belief.amount, 1.0), _MOST_QUERIES)
-    common = [lead, (best[leader] - most) / max(lead, _LEAST_LEAD), lead / expected[0], *np.log(expected[1:])]
+    unseen = max((_least_familiar(index, leader, rows[0, :, :2]) - expected_mean) / expected[0], -1.0)
+    common = [lead, (best[leader] - most) / max(lead, _LEAST_LEAD), lead / expected[0], *np.log(expected[1:]), unseen]
     return np.array([*common, *np.log([apart_deg, queries]), *(each[0] - others), *each[0]])
+
+
+def _least_familiar(index: DenseIndex, place: int, seen: IndexArray) -> float:
+    """Return z of an object's view and the most similar of its ``seen`` views, of the view for which it is least."""
+    vectors, space = index.vectors, index.space
+    return float((vectors[seen.ravel()] @ vectors[index.rows_of(place)].T).max(axis=0).min() - space.usual.sum())
 
 
 def near_twins(belief: Belief, leader: int, places: IndexArray) -> NDArray[np.bool_]:

@@ -22,6 +22,8 @@ SHARPNESS: Final = 50.0
 # 60, or one for each peak, are worse: the bins of one arc represent what is unknown (decision 0014)
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3  # smaller: more hypotheses are compared, which can hardly change the choice
+#: Most weight of an object that is not enrolled, relative to all enrolled ones.
+_MOST_ODDS: Final = 1.0  # more: the candidates are told apart later
 #: Distance in degrees up to which a view near an earlier one adds little.
 _NEAR_DEG: Final = 15.0
 #: Rotations in steps of 5 degrees, the shorter way round.
@@ -63,14 +65,17 @@ def next_best_view(
     *,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
+    not_enrolled: float = 0.0,
 ) -> NextBestView:
     """Choose the rotation with the lowest sum of expected confusion and cost.
 
     For hypotheses p, p' of different objects, a rotation a leaves the confusion
     Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 15°)²) discounts a view
     at the distance d from the nearest earlier one, and κ(a) = exp(-½ (e / 15°)²) one at the distance e from the nearest
-    enrolled view, because nothing is known about the views between. The logarithm of the confusion and the time in
-    seconds are added up; of equal sums, the earlier rotation is chosen.
+    enrolled view, because nothing is known about the views between. The object may also be one that is not enrolled.
+    The sum has a pair of the leader and this one, by its odds, as if it looked from all sides like the leader's views
+    at the earlier queries. The logarithm of the confusion and the time in seconds are added up; of equal sums, the
+    earlier rotation is chosen.
 
     Parameters
     ----------
@@ -80,6 +85,8 @@ def next_best_view(
         Possible rotations, e.g. within the cable budget; by default every 5 degrees, the shorter way round.
     seconds : array (a,), optional
         Time of each by the bench's motion model; by default at 90 degrees per second.
+    not_enrolled : float
+        Probability that the object is not enrolled.
 
     Raises
     ------
@@ -107,21 +114,36 @@ def next_best_view(
     apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
     pairs = pairs_after(belief, angles_deg)
-    is_one = not len(pairs.probability)  # one object alone: a new side helps to find its azimuth
-    if is_one:
-        confusion = -SHARPNESS * novelty
-    else:
-        remaining = pairs.probability * np.exp(-SHARPNESS * (novelty[:, None] * pairs.known) * (1 - pairs.similar))
-        confusion = log_confusion(remaining)
+    remaining = pairs.probability * np.exp(-SHARPNESS * (novelty[:, None] * pairs.known) * (1 - pairs.similar))
+    confusion = 2 * remaining.sum(axis=1)
+    odds = min(not_enrolled / max(1 - not_enrolled, _NEGLIGIBLE), _MOST_ODDS)
+    if odds > _NEGLIGIBLE:
+        confusion += odds * _with_what_was_seen(belief, angles_deg, novelty)
+    # one enrolled object alone: a new side helps to find its azimuth
+    confusion = _logarithm(confusion) if confusion.any() else -SHARPNESS * novelty
     # Choose the best one, and name the pair that it separates most.
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
     similarity: FloatArray | None = None
-    if not is_one:
+    if len(pairs.probability):
         most = int((pairs.probability - remaining[chosen]).argmax())
         pair, similarity = pairs.named(most), pairs.similar[:, most]
     rotation_deg = float(angles_deg[chosen])
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
+
+
+def _with_what_was_seen(belief: Belief, rotations_deg: FloatArray, novelty: FloatArray) -> FloatArray:
+    """Return the confusion of the leader, (a,), with an object that looks like its views at the earlier queries."""
+    probability, place, bin_of = strongest(belief.posterior)
+    own = place == place[0]
+    probability, place, bin_of = probability[own], place[own], bin_of[own]
+    rows, away_deg = expected_views(belief, place, bin_of, rotations_deg)
+    seen, _ = expected_views(belief, place, bin_of, belief.orientation_deg - belief.orientation_deg[-1])
+    known = np.exp(-0.5 * (away_deg / _NEAR_DEG) ** 2)
+    vectors, largest = belief.index.vectors, belief.index.space.largest.sum()
+    similar = np.einsum("amd,qmd->aqm", vectors[rows], vectors[seen]).max(axis=1) / largest
+    confusion: FloatArray = np.exp(-SHARPNESS * novelty[:, None] * known * (1 - similar)) @ probability
+    return confusion
 
 
 class Pairs(NamedTuple):
@@ -168,8 +190,12 @@ def pairs_after(belief: Belief, rotations_deg: FloatArray) -> Pairs:
 
 def log_confusion(remaining: FloatArray) -> FloatArray:
     """Return the logarithm of the probability of a confusion, (a,), from what remains of each pair, (a, p)."""
-    confusion: FloatArray = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
-    return confusion
+    return _logarithm(2 * remaining.sum(axis=1))
+
+
+def _logarithm(confusion: FloatArray) -> FloatArray:
+    logarithm: FloatArray = np.log(np.maximum(confusion, 1e-300))
+    return logarithm
 
 
 @lru_cache(maxsize=_STRONGEST)

@@ -318,7 +318,9 @@ class DenseSession:
 
     def next_best_view(self, rotations_deg: ArrayLike | None = None, seconds: ArrayLike | None = None) -> NextBestView:
         """Return the rotation to the next best view, as `hbr.next_best_view` does."""
-        return next_best_view(self.belief, rotations_deg=rotations_deg, seconds=seconds)
+        return next_best_view(
+            self.belief, rotations_deg=rotations_deg, seconds=seconds, not_enrolled=self.decision.not_enrolled
+        )
 
     def among_enrolled(self) -> FloatArray:
         """Return the probability of every object considered if the object on the table is enrolled, (k,)."""

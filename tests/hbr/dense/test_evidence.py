@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from hbr import DenseIndex
+from hbr import DenseIndex, Views
 from hbr.dense.evidence import COMMON, numbers
 from tests.hbr.dense.searches import LIGHT, belief_after, catalog, view
 
 QUERIES_DEG = (30.0, 150.0, 270.0)
-LEAD, SECOND, BETWEEN, EXPECTED, EXPECTED_OVER_BEST, APART, QUERIES = range(COMMON)
+LEAD, SECOND, BETWEEN, EXPECTED, EXPECTED_OVER_BEST, UNSEEN, APART, QUERIES = range(COMMON)
 
 
 def search(index: DenseIndex, share: float, j: int = 2) -> np.ndarray:
@@ -79,3 +79,19 @@ def test_one_object_alone_is_compared_with_nothing() -> None:
     assert leads.sum() == pytest.approx(z, rel=0.05)
     assert found[SECOND] == 1
     assert found[EXPECTED] == found[EXPECTED_OVER_BEST]
+
+
+def test_a_side_unlike_the_sides_that_were_seen_counts_until_it_is_seen() -> None:
+    """An object with a mark on one side: without that side, its twin without the mark would look the same."""
+    views = catalog(4, step_deg=15.0)
+    levels = views.descriptors.copy()
+    own = views.of(0)
+    levels[own] = levels[own[0]]
+    levels[own[12:14]] = view(catalog(1, seed=5), 0, 0.0)
+    index = DenseIndex(Views(levels, views.azimuth_deg, views.object_index, views.object_names, views.descriptor))
+    before, after = (
+        numbers(belief_after([levels[own[n]] for n in seen], [15.0 * n for n in seen], index), 0)[UNSEEN]
+        for seen in ((0, 4), (0, 4, 12))
+    )
+    assert before < 0.5
+    assert after > 0.9

@@ -49,6 +49,13 @@ def test_twins_are_distinguished_at_the_azimuth_of_their_difference(azimuth: flo
     assert low <= most_informative_rotation(update_belief(viewed(azimuth), 0.0, INDEX)) <= high
 
 
+def test_an_object_that_may_not_be_enrolled_is_viewed_where_the_leader_looks_different() -> None:
+    """A twin without the mark is not enrolled: only the marked side can show that."""
+    belief = update_belief(viewed(30.0), 0.0, DenseIndex(VIEWS.select(np.concatenate([VIEWS.of(1), VIEWS.of(2)]))))
+    assert 145 <= next_best_view(belief, not_enrolled=0.3).rotation_deg <= 185
+    assert not 145 <= next_best_view(belief).rotation_deg <= 185
+
+
 def test_only_rotations_that_the_cable_allows_are_chosen() -> None:
     belief = update_belief(viewed(30.0), 0.0, INDEX)
     allowed = np.array([-90.0, -40.0, 20.0, 70.0])
