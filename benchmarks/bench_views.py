@@ -80,8 +80,7 @@ def one_view(size: tuple[int, int]) -> None:
         "- describe, cedd and edges+colours+cedd": (lambda: described(replace(found)), 200),
         "whole view, guessed": (lambda: described(segment(image)), 30),
         "- guess": (lambda: guess_object(small), 30),
-        "network": (lambda: shares(small, textured=True), 30),
-        "network before a plain background": (lambda: shares(small, textured=False), 30),
+        "network": (lambda: shares(small), 30),
     }
     for name, (work, repeats) in parts.items():
         record(f"{size[0]}x{size[1]}: {name}", fastest(work, repeats), "cv2.resize to 80 x 80", peer)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property, lru_cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,6 +33,13 @@ _EVERY: Final = 5  # a plane has three parameters: a pixel in 25 is enough, and 
 #: Number that is added to grey levels before the logarithm, because noise dominates below it.
 _FLOOR: Final = 6.0
 _LOG: Final = np.log(np.arange(256) + _FLOOR).astype(np.float32)
+#: Steps of logarithms as whole numbers, whose differences take a tenth of the time.
+_STEPS: Final = 250.0
+_LOG_STEPS: Final = np.rint(_STEPS * _LOG).astype(np.int16)
+#: The difference of pixels that differ by 0 to 255 steps, from about -0.7 to 1 and fine where it is small; how equal
+#: they are.
+_FAR: Final = np.minimum(np.log((np.arange(256) / _STEPS + 0.01) / 0.06) / 2.5, 1).astype(np.float32)
+_EQUAL: Final = (1 / (1 + (np.arange(256) / _STEPS / 0.07) ** 4)).astype(np.float32)
 #: Noise of the logarithm of each grey level.
 _NOISE: Final = (0.35 * 8.0 / (np.arange(256) + _FLOOR)).astype(np.float32)
 #: Small regularisation that makes the least squares solvable.
@@ -50,9 +57,7 @@ _CELL_SHARE: Final = 0.6
 MIN_AGREEMENT: Final = 0.65
 #: Pixels that are compared with the border's colours at once: they fit into the processor's cache.
 _BLOCK: Final = 1024  # with more, BLAS starts threads, which take longer than the comparison
-#: Grey levels by which most pixels of a texture differ from the mean of their neighbours, and how far these are.
-# half of the pixels of plain backdrops and of cloth differ by 0.7 or less, those of drawn textures by 1.1 or more
-_ROUGH: Final = 1.0
+#: A texture is what differs from the mean of the neighbours within so many pixels.
 _WITHIN_PX: Final = 4
 #: A learned background is used if at least this share of the frame's edge, of this width, agrees.
 # not of the border's cells, which an object that fills the frame covers: photographs of such objects agree with 58 %
@@ -176,10 +181,12 @@ class Difference:
         Mean over the channels of what remains of the difference, in logarithms.
     coloured : float32 array (h, w)
         Largest distance of a channel from that mean.
-    spread : float32 array (h, w)
-        How much the background itself changes from view to view, in logarithms; 0 for an empty-table image.
-    trust : float
-        1 for an empty-table image; less for a background that was learned from views, 0.1 for each of them.
+    residual : float32 array (h, w, 3)
+        What remains of the difference in each channel, in logarithms.
+    background : Background
+        The background.
+    still : bool
+        Whether the frame's edge looks like the background.
     """
 
     agreement: float
@@ -188,6 +195,7 @@ class Difference:
     correction: Illumination
     evenly: Floats
     coloured: Floats
+    residual: Floats
     background: "Background"
     still: bool
 
@@ -200,6 +208,26 @@ class Difference:
     def is_enough(self) -> bool:
         """Whether as many pixels differ as an object has."""
         return int(np.count_nonzero(self.certain | self.possible)) >= LEAST * self.certain.size
+
+
+class Likeness(NamedTuple):
+    """How a frame differs from the views that its background was learned from, or from the empty-table image.
+
+    Differences are the largest of a pixel's channels, on the scale `_FAR`.
+
+    Attributes
+    ----------
+    nearest : float32 array (h, w)
+        Difference from the view that is most similar in this pixel.
+    usual : float32 array (h, w)
+        Median of the differences.
+    equal : float32 array (h, w)
+        Share of the views that are equal in this pixel.
+    """
+
+    nearest: Floats
+    usual: Floats
+    equal: Floats
 
 
 class Background:
@@ -250,16 +278,37 @@ class Background:
         return len(self._views)
 
     @cached_property
+    def _apart(self) -> list[NDArray[np.int16]]:
+        """How far each view is from the background, without the camera's exposure, in `_STEPS`, (h, w, 3)."""
+        own = cv2.LUT(self._grey_levels, _LOG_STEPS)
+        apart = [cv2.subtract(cv2.LUT(small, _LOG_STEPS), own) for small in self._views]
+        middles = [_medians(np.ascontiguousarray(one[::6, ::6].reshape(-1, 3).T)).tolist() for one in apart]
+        return [
+            np.asarray(cv2.subtract(one, np.array([*middle, 0.0])), np.int16)
+            for one, middle in zip(apart, middles, strict=True)
+        ]
+
+    @cached_property
     def spread(self) -> Floats:
         """How much the background changes from view to view, in logarithms, (h, w); 0 for an empty-table image."""
-        height, width = self._log.shape[:2]
         if not self._views:
-            return np.zeros((height, width), np.float32)
-        # every second pixel is enough, and takes a quarter of the time
-        apart = [_logarithm(small[::2, ::2]) - self._log[::2, ::2] for small in self._views]
-        apart = [np.abs(one - np.median(one[::3, ::3], axis=(0, 1))) for one in apart]  # without the camera's exposure
-        spread = _largest(cv2.split(np.mean(apart, axis=0, dtype=np.float32)))
-        return np.asarray(cv2.resize(spread, (width, height)), np.float32)
+            return np.zeros(self._log.shape[:2], np.float32)
+        away = np.abs(self._apart[0])
+        for one in self._apart[1:]:  # NumPy's sum of a list copies it first, and takes five times as long
+            away += np.abs(one)
+        return np.asarray(_largest(cv2.split(away)) * np.float32(1 / (_STEPS * len(self._apart))), np.float32)
+
+    def likeness(self, difference: "Difference") -> "Likeness":
+        """Compare the frame of a difference with each view that the background was learned from, or with the image."""
+        residual = np.rint(difference.residual * np.float32(_STEPS)).astype(np.int16)
+        # saturated: nothing depends on a difference of a factor of 2.8
+        away = [cv2.convertScaleAbs(cv2.subtract(residual, one)) for one in self._apart] or [
+            cv2.convertScaleAbs(residual)
+        ]
+        far = [np.asarray(_largest(cv2.split(one)), np.uint8) for one in away]
+        equal = np.add.reduce([cv2.LUT(one, _EQUAL) for one in far]) * np.float32(1 / len(far))
+        nearest, usual = (cv2.LUT(one, _FAR) for one in (np.minimum.reduce(far), median(far)))
+        return Likeness(*(np.asarray(plane, np.float32) for plane in (nearest, usual, equal)))
 
     @cached_property
     def differs(self) -> Mask | None:
@@ -279,7 +328,8 @@ class Background:
     def difference(self, small: ImageArray) -> Difference:
         """Compare a small frame, as `shrunk` returns it, with the empty-table image."""
         slopes = _fit(small, self._useful, self._log)
-        evenly, coloured, certain, possible, agrees = self._planes(small, Illumination(slopes))
+        residual = _logarithm(small) - self._log - Illumination(slopes).over(*small.shape[:2])
+        evenly, coloured, certain, possible, agrees = self._planes(small, residual)
         # a shadow is smooth: a fine texture that the table does not have belongs to an object
         grain = (np.abs(cv2.Laplacian(evenly, cv2.CV_32F, ksize=3)) > 0.5).astype(np.float32)
         certain |= possible & (cv2.blur(grain, (5, 5)) > 0.15)
@@ -294,13 +344,14 @@ class Background:
             Illumination(-slopes),
             evenly,
             coloured,
+            residual,
             self,
             bool(edge >= _STILL * (agrees.size - inner.size)),
         )
 
-    def _planes(self, small: ImageArray, illumination: Illumination) -> tuple[Floats, Floats, Mask, Mask, Mask]:
+    def _planes(self, small: ImageArray, remaining: Floats) -> tuple[Floats, Floats, Mask, Mask, Mask]:
         """Return the planes of a `Difference`, without the grain, and where the frame agrees with this image."""
-        residual = cv2.split(_logarithm(small) - self._log - illumination.over(*small.shape[:2]))
+        residual = cv2.split(remaining)
         evenly = (residual[0] + residual[1] + residual[2]) * np.float32(1 / 3)
         coloured = np.asarray(_largest([cv2.absdiff(part, evenly) for part in residual]), np.float32)
         # one grey level of noise is a larger share of a dark pixel
@@ -393,16 +444,20 @@ def from_border(small: ImageArray) -> Floats:
 
     Brightness counts half, because shadows and folds of a cloth change it more than the colour.
     """
+    height, width = small.shape[:2]
     coarse = cv2.resize(small, (16, 12), interpolation=cv2.INTER_AREA)
     border = np.concatenate([coarse[0], coarse[-1], coarse[1:-1, 0], coarse[1:-1, -1]])[None]
-    colours, near = _opponents(small), _opponents(np.ascontiguousarray(border, np.uint8))
-    own = np.einsum("nc,nc->n", near, near)[:, None]
+    # every second pixel is enough, and takes a quarter of the time
+    half = cv2.resize(small, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
+    colours, near = _opponents(np.asarray(half, np.uint8)), _opponents(np.ascontiguousarray(border, np.uint8))
+    # |near - colour|² without |colour|², as one matrix product with a fifth column
+    near = np.concatenate([-2 * near, np.einsum("nc,nc->n", near, near)[:, None]], axis=1)
     squares = np.einsum("nc,nc->n", colours, colours)
+    colours = np.concatenate([colours, np.ones((len(colours), 1), np.float32)], axis=1)
     for start in range(0, len(colours), _BLOCK):
-        block = np.s_[start : start + _BLOCK]
-        squares[block] += (own - 2 * (near @ colours[block].T)).min(axis=0)
-    distances: Floats = np.sqrt(np.maximum(squares, 0)).reshape(small.shape[:2])
-    return distances
+        squares[start : start + _BLOCK] += (near @ colours[start : start + _BLOCK].T).min(axis=0)
+    distances = np.sqrt(np.maximum(squares, 0)).reshape(half.shape[:2])
+    return np.asarray(cv2.resize(distances, (width, height)), np.float32)
 
 
 def _opponents(image: ImageArray) -> Floats:
@@ -565,8 +620,6 @@ def _smooth(corners: list[tuple[slice, slice]], away: cv2.typing.MatLike, noise:
 class SegmentedFrame:
     """A frame, uint8 (H, W, 3), and its small image; ``described`` has its levels by descriptors of the whole frame.
 
-    ``alone`` has what the network finds in this frame alone, once it has looked.
-
     Raises `TypeError`, `ValueError`: the array is no such image.
     """
 
@@ -575,7 +628,6 @@ class SegmentedFrame:
         self.image = image_bgr
         self.small = shrunk(image_bgr)
         self.described: dict[str, LevelArray] = {}
-        self.alone: Floats | None = None
         self._compared: tuple[Background, Difference] | None = None
 
     @classmethod
@@ -588,13 +640,6 @@ class SegmentedFrame:
         if self._compared is None or self._compared[0] is not background:
             self._compared = background, background.difference(self.small)
         return self._compared[1]
-
-    @cached_property
-    def textured(self) -> bool:
-        """Whether the background has texture: at most one cell of the border has none."""
-        grey = cv2.cvtColor(self.small, cv2.COLOR_BGR2GRAY).astype(np.float32)
-        rough = cv2.absdiff(grey, cv2.GaussianBlur(grey, (0, 0), _WITHIN_PX)) > _ROUGH
-        return sorted(int(np.count_nonzero(cell)) / cell.size for cell in border_cells(rough))[1] >= 0.5
 
     @cached_property
     def differs(self) -> Mask | None:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-import cv2
 import numpy as np
 
 from hbr.core.arrays import ImageArray
@@ -28,13 +27,11 @@ from hbr.segmentation.background import (
 from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
-#: Probabilities above which a pixel belongs to the object, of the first segmentation and of further ones: before a
-#: texture, and before a plain background.
-_BEFORE_TEXTURE: Final = (0.5, 0.2, 0.8)
-_BEFORE_PLAIN: Final = (0.25, 0.5, 0.8)
-#: The same of an enrolled view with a learned background: where an object looks the same from all sides, it is part of
-#: that background, and less probable.
-_ENROLLED: Final = (0.25,)
+#: A pixel belongs to the object if it is more probable than this,
+_LEVEL: Final = 0.35
+#: and with a learned background in the first segmentation and in further ones: where an object looks the same from all
+#: sides, it is part of that background, and less probable.
+_LEVELS: Final = (0.25, 0.5, 0.8)
 #: Of a silhouette that the network finds, at least this share differs from the background,
 # 8 % or more of drawn objects whose sides look alike; 1 % or less where the drawn plain table is empty
 _SUPPORT: Final = 0.05
@@ -42,10 +39,6 @@ _SUPPORT: Final = 0.05
 # 4 % or more of frames with drawn objects, 1.2 % or less of those of the empty plain table
 _SURE: Final = 0.85
 _SURE_OF: Final = 0.02
-#: Still parts count if the mean probability of the object is this, without the rotation.
-_STILL_FROM: Final = 0.25
-#: Still parts count if they make a silhouette this much larger.
-_MORE: Final = 1.2
 #: A part is the platter, or the object of other views, if the mean of its pixels is more than this.
 _MOST: Final = 0.5
 #: A smaller expected overlap is reported.
@@ -190,18 +183,16 @@ def hypotheses(
         if seen is None or not seen.still:
             method, seen = BoxMethod.NETWORK, None
     rotated = method is BoxMethod.ROTATION
-    share, platter = shares(frame.small, seen, textured=frame.textured)
+    share, platter = shares(frame.small, seen)
     like = _found(frame, background, difference, guess=not rotated)
-    levels = (_levels(frame) if most > 1 else _ENROLLED) if rotated else _levels(frame)[:1]
+    levels = (_LEVELS if most > 1 else _LEVELS[:1]) if rotated else (_LEVEL,)
     found: list[Segmentation | Found] = []
     if by_network := _by_network(share, method, like, levels):
         found += by_network if _is_there(frame, share > min(levels), share, seen) else []
-    if rotated and found and (whole := _with_still_parts(by_network[0], like, platter)) is not None:
-        found.insert(0, whole)
     only_platter = rotated and not found and like.silhouette is not None and _mean(platter, like.silhouette) > _MOST
     if like.box is not None and not only_platter:
         sure = like.method is BoxMethod.GUESS or (like.method is BoxMethod.EMPTY_TABLE and most > 1)
-        first = not found or (not rotated and sure) or _same(like, found[0]) or _is_whole(like, found[0], platter)
+        first = not found or (not rotated and sure) or _same(like, found[0])
         found.insert(0 if first else len(found), like)
     # before a plain background, what the rotation does not show is not there
     if rotated and most > 1 and (found or frame.differs is None):
@@ -235,41 +226,6 @@ def _is_there(frame: SegmentedFrame, mask: Mask, share: Floats, seen: Difference
     return others is None or _mean(others & ~frame.differs, mask) <= _MOST
 
 
-def _is_whole(like: Found, found: Segmentation | Found, platter: Floats) -> bool:
-    """Return whether all that differs from a plain background is the object, of which the network finds a part.
-
-    The rest is then not the platter, and nothing reaches into the frame: a shadow or clutter at one of its sides.
-    """
-    if like.method is not BoxMethod.PLAIN_BACKGROUND or like.silhouette is None or found.silhouette is None:
-        return False
-    whole = like.silhouette
-    left, right, top, bottom = whole[:, 0].any(), whole[:, -1].any(), whole[0].any(), whole[-1].any()
-    fills = (left and right) or (top and bottom)
-    rest = whole & ~found.silhouette
-    return bool(fills or not (left or right or top or bottom)) and not (rest.any() and _mean(platter, rest) > _MOST)
-
-
-def _with_still_parts(found: Found, like: Found, platter: Floats) -> Found | None:
-    """Return a silhouette with all that differs from a plain border around it, if that is more; without the platter.
-
-    An even surface of revolution, such as the glass of a bottle, looks still while it rotates. So the network, which
-    then sees this frame alone, must take it for the object.
-    """
-    if like.method is not BoxMethod.PLAIN_BACKGROUND or like.silhouette is None or found.silhouette is None:
-        return None
-    rest = like.silhouette & (platter < _MOST)
-    _, labels = cv2.connectedComponents(rest.astype(np.uint8))
-    own = np.unique(labels[found.silhouette & rest])
-    whole = np.isin(labels, own[own > 0]) | found.silhouette
-    added = whole & ~found.silhouette
-    if np.count_nonzero(added) < (_MORE - 1) * np.count_nonzero(found.silhouette):
-        return None
-    if _mean(_share_alone(found.frame), added) < _STILL_FROM:
-        return None
-    mask = silhouette(whole, framed=False)
-    return None if mask is None else replace(found, silhouette=mask)
-
-
 def _mean(values: Floats | Mask, mask: Mask) -> float:
     return float(values[mask].mean())
 
@@ -294,18 +250,7 @@ def without_background(frame: SegmentedFrame) -> tuple[Found, ...]:
 
 def _alone(frame: SegmentedFrame, like: Found) -> list[Found]:
     """Return the network's silhouette of a frame whose background is not known."""
-    return _by_network(_share_alone(frame), BoxMethod.NETWORK, like, _levels(frame)[:1])
-
-
-def _share_alone(frame: SegmentedFrame) -> Floats:
-    """Return the probability of the object in a frame whose background is not known; the network looks once."""
-    if frame.alone is None:
-        frame.alone = shares(frame.small, textured=frame.textured).object
-    return frame.alone
-
-
-def _levels(frame: SegmentedFrame) -> tuple[float, ...]:
-    return _BEFORE_TEXTURE if frame.textured else _BEFORE_PLAIN
+    return _by_network(shares(frame.small).object, BoxMethod.NETWORK, like, (_LEVEL,))
 
 
 def _by_network(share: Floats, method: BoxMethod, like: Found, levels: tuple[float, ...]) -> list[Found]:

@@ -1,15 +1,15 @@
 """The object's silhouette: from the pixels that differ from the background, by its colours, or by a neural network.
 
-A small network labels the object, the platter, and everything else. It sees a small frame and, where the background
-is known, the frame's difference from it. The background is known from the empty-table image, or was learned while the
-table rotated. Before a plain background another network finds more: it also sees how much the background changes from
-view to view, and the colours of the border. The weights are in the wheel. The model card says how they were made:
+A small network labels the object, the platter, and everything else. It sees a small frame and the colours of its border
+and, where the background is known, the frame's difference from it. The background is known from the empty-table image,
+or was learned while the table rotated: then the network also sees how much it changes from view to view, and whether
+each pixel is as in other views. The weights are in the wheel. The model card says how they were made:
 docs/explanation/segmentation-network.md.
 
 Decision: docs/decisions/0013.
 """
 
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 from importlib.resources import files
 from typing import Any, Final, NamedTuple
 
@@ -219,9 +219,8 @@ _EVENLY: Final = 1.0
 _COLOURED: Final = 0.7  # smaller than `_EVENLY`, because shadows change the brightness more than the colour
 _SPREAD_SCALE: Final = 0.5
 _FROM_BORDER: Final = 1.0
-#: Trust in a background that was learned from other views, of each network; 1 for an empty-table image.
-_LEARNED: Final = 0.5  # less than an image that was taken for this purpose, more than none
-_OF_A_VIEW: Final = 0.1  # for each of the views
+#: Trust in a background for each view that it was learned from; 1 for an empty-table image.
+_OF_A_VIEW: Final = 0.1
 
 
 class Shares(NamedTuple):
@@ -231,16 +230,13 @@ class Shares(NamedTuple):
     platter: Floats
 
 
-def shares(small: ImageArray, difference: Difference | None = None, *, textured: bool) -> Shares:
+def shares(small: ImageArray, difference: Difference | None = None) -> Shares:
     """Return where a small frame, as `hbr.segmentation.background.shrunk` returns it, shows the object and the platter.
 
-    ``difference`` is the frame's from its background, if that is known; ``textured`` says whether that has texture.
+    ``difference`` is the frame's from its background, if that is known.
     """
     height, width = small.shape[:2]
-    shown = _shown(small, difference)
-    logits = (
-        _interleaved(_BEFORE_TEXTURE(shown)) if textured else _BEFORE_PLAIN(_with_context(shown, small, difference))
-    )
+    logits = _interleaved(_NETWORK(_planes(small, difference)))
     found = [1 / (1 + cv2.exp(-plane)) for plane in logits[0]]
     if (height, width) != (HEIGHT, WIDTH):
         found = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in found]
@@ -257,29 +253,22 @@ def _interleaved(fourfold: Floats) -> Floats:
     return apart.transpose(0, 3, 1, 4, 2).reshape(1, planes // 4, 2 * height, 2 * width)
 
 
-def _shown(small: ImageArray, difference: Difference | None) -> Floats:
-    """Return the input of the network for textures, float32 (1, 8, HEIGHT, WIDTH)."""
-    planes = np.zeros((1, 8, HEIGHT, WIDTH), np.float32)
+def _planes(small: ImageArray, difference: Difference | None) -> Floats:
+    """Return the network's input, float32 (1, 13, HEIGHT, WIDTH)."""
+    planes = np.zeros((1, 13, HEIGHT, WIDTH), np.float32)
     planes[0, :3] = _sized(small).transpose(2, 0, 1)
     planes[0, :3] *= np.float32(1 / 255)
     planes[0, :3] -= np.float32(0.5)
     planes[0, 3:5] = _places()
-    if difference is not None:
-        planes[0, 5] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
-        planes[0, 6] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
-        planes[0, 7] = _LEARNED if difference.background.views else 1.0
-    return planes
-
-
-def _with_context(shown: Floats, small: ImageArray, difference: Difference | None) -> Floats:
-    """Return the input of the network for plain backgrounds, float32 (1, 10, HEIGHT, WIDTH)."""
-    planes = np.zeros((1, 10, HEIGHT, WIDTH), np.float32)
-    planes[0, :5], planes[0, 6:8] = shown[0, :5], shown[0, 5:7]
     planes[0, 5] = np.minimum(_sized(from_border(small)) * np.float32(1 / _FROM_BORDER), 1)
     if difference is not None:
         background = difference.background
+        planes[0, 6] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
+        planes[0, 7] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
         planes[0, 8] = np.minimum(_sized(background.spread) * np.float32(1 / _SPREAD_SCALE), 1)
-        planes[0, 9] = _OF_A_VIEW * background.views or 1.0
+        for plane, compared in zip(planes[0, 9:12], background.likeness(difference), strict=True):
+            plane[:] = _sized(compared)
+        planes[0, 12] = _OF_A_VIEW * background.views or 1.0
     return planes
 
 
@@ -296,9 +285,8 @@ def _places() -> Floats:
     return np.stack([x, y]).astype(np.float32)
 
 
-def _weights(name: str) -> bytes:
-    return files("hbr.segmentation").joinpath(name).read_bytes()
+def _weights() -> bytes:
+    return files("hbr.segmentation").joinpath("network.onnx").read_bytes()
 
 
-_BEFORE_TEXTURE: Final = SharedNet(partial(_weights, "network.onnx"))
-_BEFORE_PLAIN: Final = SharedNet(partial(_weights, "network-plain.onnx"))
+_NETWORK: Final = SharedNet(_weights)
