@@ -139,15 +139,16 @@ def decide(
 ) -> StopDecision:
     """Decide whether a search ends after these views.
 
-    An object is found if its probability reaches `MIN_CONFIDENCE`, after the last view `LAST_CONFIDENCE`. An object
-    that is hardly enrolled ends the search as unknown. After the last view, an object that is not found is unknown if
+    An object is found if its probability reaches `MIN_CONFIDENCE`. After the last view `LAST_CONFIDENCE` is enough, but
+    not if the rest is that of a similar enrolled object: a wrong name is worse than two names. An object that is hardly
+    enrolled ends the search as unknown. After the last view, an object that is not found is unknown if
     it is probably not enrolled, and otherwise ambiguous. If the views were not segmented reliably, the search continues
     until the last view: another view costs little, and the background is then known.
     """
     probability, not_enrolled = posterior(belief, fit, other_bench=other_bench)
     place = int(probability.argmax())
     best = float(probability[place])
-    least = LAST_CONFIDENCE if last else MIN_CONFIDENCE
+    least = max(LAST_CONFIDENCE, MIN_CONFIDENCE * (1 - not_enrolled)) if last else MIN_CONFIDENCE
     if best >= least:
         outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
     elif not_enrolled >= (UNKNOWN_FROM if last else HOPELESS):

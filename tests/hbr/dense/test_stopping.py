@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hbr import Belief, DenseIndex, Outcome, StopReason
+from hbr import Belief, DenseIndex, Outcome, StopReason, Views
 from hbr.dense.pixel_fit import PixelFit
 from hbr.dense.stopping import LAST_CONFIDENCE, MIN_CONFIDENCE, UNKNOWN_FROM, among_enrolled, decide, posterior
 from tests.fuzzing import examples
@@ -51,7 +51,8 @@ def test_decision_follows_from_the_posterior(share: float, count: int) -> None:
         found = decide(belief, last=last)
         assert found.object_index == probability.argmax()
         assert (found.probability, found.not_enrolled) == (probability.max(), not_enrolled)
-        assert found.min_confidence == (LAST_CONFIDENCE if last else MIN_CONFIDENCE)
+        least = max(LAST_CONFIDENCE, MIN_CONFIDENCE * (1 - not_enrolled)) if last else MIN_CONFIDENCE
+        assert found.min_confidence == least
         assert (found.outcome is Outcome.FOUND) == (found.probability >= found.min_confidence)
         if last:
             assert found.outcome is not Outcome.CONTINUE
@@ -74,6 +75,18 @@ def test_enrolled_objects_are_found_and_others_are_unknown() -> None:
         other = belief_after([view(STRANGE, j, deg) for deg in QUERIES_DEG], QUERIES_DEG, INDEX)
         found = decide(other, last=True)
         assert (found.outcome, found.reason) == (Outcome.UNKNOWN, StopReason.NOT_ENROLLED)
+
+
+def test_a_similar_enrolled_object_is_a_reason_for_two_names_and_one_that_is_not_enrolled_is_none() -> None:
+    """After the last view, 90 % for one object and 10 % for its twin end as ambiguous."""
+    twins = catalog(2, seed=1)
+    levels = twins.descriptors.copy()
+    levels[twins.of(1)] = levels[twins.of(0)]
+    index = DenseIndex(Views(levels, twins.azimuth_deg, twins.object_index, twins.object_names, twins.descriptor))
+    belief = belief_after([view(twins, 0, deg) for deg in QUERIES_DEG[:2]], QUERIES_DEG[:2], index)
+    decisions = [decide(belief, last=True, fit=PixelFit(0, 0.9, 0.9 - by, 0.3, 0.85)) for by in (0.15, 0.5)]
+    assert [found.outcome for found in decisions] == [Outcome.AMBIGUOUS, Outcome.FOUND]
+    assert all(LAST_CONFIDENCE <= found.probability for found in decisions)
 
 
 def test_a_search_between_both_is_ambiguous_only_after_its_last_view() -> None:
