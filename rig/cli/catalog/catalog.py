@@ -6,7 +6,6 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
-from rig.cli.ui.jobs import size_words
 from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
@@ -232,30 +231,3 @@ def undelete_(
         catalog.undelete(name)
         views = catalog.summary(name).views
     settings.say(f"Restored {name} with {counted(views, 'view')}.", {"name": name, "views": views})
-
-
-@app.command("stats")
-@command
-def stats(settings: Settings) -> None:
-    """Show what the catalog contains, and its size.
-
-    Example: rig catalog stats --bench sim --json
-    """
-    from rig.catalog.upkeep import statistics
-    from rig.core.json_form import plain
-
-    with settings.open_catalog(read_only=True) as catalog:
-        found, place = statistics(catalog), catalog.place
-    lines = {
-        "catalog": f"{place}, schema version {found.schema_version}",
-        "objects": f"{found.objects}" + (f" (+{found.deleted_objects} deleted)" if found.deleted_objects else ""),
-        "enrollments": ", ".join(f"{count} {status}" for status, count in found.enrollments.items()) or "none",
-        "views": found.views,
-        "images": size_words(found.image_bytes),
-        "database": size_words(found.database_bytes),
-        "free": "–" if found.free_disk_bytes is None else size_words(found.free_disk_bytes),
-        "log": f"{found.log_entries} entries",
-        "results": f"{found.results}, {size_words(found.result_image_bytes)} of images",
-    }
-    words = "\n".join(f"{name:16} {text}" for name, text in lines.items())
-    settings.say(words, {"catalog": str(place), **plain(found)})

@@ -86,7 +86,7 @@ def test_a_similar_enrolled_object_is_a_reason_for_two_names_and_one_that_is_not
     belief = belief_after([view(twins, 0, deg) for deg in QUERIES_DEG[:2]], QUERIES_DEG[:2], index)
     decisions = [decide(belief, last=True, fit=PixelFit(0, 0.9, 0.9 - by, 0.3, 0.85)) for by in (0.15, 0.5)]
     assert [found.outcome for found in decisions] == [Outcome.AMBIGUOUS, Outcome.FOUND]
-    assert all(LAST_CONFIDENCE <= found.probability for found in decisions)
+    assert all(found.probability >= LAST_CONFIDENCE for found in decisions)
 
 
 def test_a_search_between_both_is_ambiguous_only_after_its_last_view() -> None:
