@@ -47,7 +47,7 @@ def numbers(belief: Belief, leader: int) -> FloatArray:
     - the lead, relative to the lead that the two enrolled views beside the estimated azimuth have among each other,
     - the logarithms of the lead that is expected of a view between these two, and of the same over the best of the
       cohort instead of its mean: how different the leader is from the cohort,
-    - the lead of the leader's least familiar side, relative to the same as the third number: how much the enrolled view
+    - the lead of the leader's most different side, relative to the same as the third number: how much the enrolled view
       that resembles those at the estimated poses least resembles them. An object that is not enrolled may differ there,
     - the logarithms of the mean distance of the leader's enrolled views in degrees, and of the number of queries,
     - the lead of each use of a part, and its z.
@@ -79,12 +79,12 @@ def numbers(belief: Belief, leader: int) -> FloatArray:
     )
     apart_deg = max(360 / len(index.rows_of(leader)), _LEAST_APART_DEG)
     queries = min(max(belief.amount, 1.0), _MOST_QUERIES)
-    unseen = max((_least_familiar(index, leader, rows[0, :, :2]) - expected_mean) / expected[0], -1.0)
+    unseen = max((_most_different(index, leader, rows[0, :, :2]) - expected_mean) / expected[0], -1.0)
     common = [lead, (best[leader] - most) / max(lead, _LEAST_LEAD), lead / expected[0], *np.log(expected[1:]), unseen]
     return np.array([*common, *np.log([apart_deg, queries]), *(each[0] - others), *each[0]])
 
 
-def _least_familiar(index: DenseIndex, place: int, seen: IndexArray) -> float:
+def _most_different(index: DenseIndex, place: int, seen: IndexArray) -> float:
     """Return z of an object's view and the most similar of its ``seen`` views, of the view for which it is least."""
     vectors, space = index.vectors, index.space
     return float((vectors[seen.ravel()] @ vectors[index.rows_of(place)].T).max(axis=0).min() - space.usual.sum())

@@ -23,7 +23,7 @@ SHARPNESS: Final = 50.0
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3  # smaller: more hypotheses are compared, which can hardly change the choice
 #: Most weight of an object that is not enrolled, relative to all enrolled ones.
-_MOST_ODDS: Final = 1.0  # more: the candidates are told apart later
+_MOST_ODDS: Final = 1.0  # more: the enrolled candidates are separated later
 #: Distance in degrees up to which a view near an earlier one adds little.
 _NEAR_DEG: Final = 15.0
 #: Rotations in steps of 5 degrees, the shorter way round.

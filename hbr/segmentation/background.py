@@ -210,7 +210,7 @@ class Difference:
         return int(np.count_nonzero(self.certain | self.possible)) >= LEAST * self.certain.size
 
 
-class Likeness(NamedTuple):
+class ViewDifferences(NamedTuple):
     """How a frame differs from the views that its background was learned from, or from the empty-table image.
 
     Differences are the largest of a pixel's channels, on the scale `_FAR`.
@@ -298,7 +298,7 @@ class Background:
             away += np.abs(one)
         return np.asarray(_largest(cv2.split(away)) * np.float32(1 / (_STEPS * len(self._apart))), np.float32)
 
-    def likeness(self, difference: "Difference") -> "Likeness":
+    def view_differences(self, difference: "Difference") -> "ViewDifferences":
         """Compare the frame of a difference with each view that the background was learned from, or with the image."""
         residual = np.rint(difference.residual * np.float32(_STEPS)).astype(np.int16)
         # saturated: nothing depends on a difference of a factor of 2.8
@@ -308,7 +308,7 @@ class Background:
         far = [np.asarray(_largest(cv2.split(one)), np.uint8) for one in away]
         equal = np.add.reduce([cv2.LUT(one, _EQUAL) for one in far]) * np.float32(1 / len(far))
         nearest, usual = (cv2.LUT(one, _FAR) for one in (np.minimum.reduce(far), median(far)))
-        return Likeness(*(np.asarray(plane, np.float32) for plane in (nearest, usual, equal)))
+        return ViewDifferences(*(np.asarray(plane, np.float32) for plane in (nearest, usual, equal)))
 
     @cached_property
     def differs(self) -> Mask | None:

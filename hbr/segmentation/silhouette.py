@@ -266,7 +266,7 @@ def _planes(small: ImageArray, difference: Difference | None) -> Floats:
         planes[0, 6] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
         planes[0, 7] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
         planes[0, 8] = np.minimum(_sized(background.spread) * np.float32(1 / _SPREAD_SCALE), 1)
-        for plane, compared in zip(planes[0, 9:12], background.likeness(difference), strict=True):
+        for plane, compared in zip(planes[0, 9:12], background.view_differences(difference), strict=True):
             plane[:] = _sized(compared)
         planes[0, 12] = _OF_A_VIEW * background.views or 1.0
     return planes

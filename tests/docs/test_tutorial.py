@@ -21,7 +21,7 @@ def test_commands_of_the_tutorial_end_as_it_says(tmp_path, monkeypatch, whole_fr
     monkeypatch.chdir(tmp_path)
     outputs = {}
     for command in re.findall(r"^rig (.*)$", page, re.MULTILINE):
-        typed = command if whole_frames else command.replace("--views 12", "--views 6")
+        typed = command if whole_frames else command.replace("--views 12", "--views 8")
         done = CliRunner().invoke(app, shlex.split(typed))
         expected = next((code for start, code in EXIT_CODES.items() if command.startswith(start)), 0)
         assert done.exit_code == expected, f"rig {command}\n{done.output}"

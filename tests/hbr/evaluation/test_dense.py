@@ -46,12 +46,14 @@ def test_trial_equals_the_literal_protocol(name: str, protocol: Protocol) -> Non
             ranking = belief.ranking()
             assert runs.rank[0, 0, t, n] == ranking.object_index.tolist().index(j) + 1
             assert runs.score[0, 0, t, n] == ranking.scores[0]
-            assert OUTCOMES[runs.outcome[0, 0, t, n]] is decide(belief, last=n == 3).outcome
+            decision = decide(belief, last=n == 3)
+            assert OUTCOMES[runs.outcome[0, 0, t, n]] is decision.outcome
+            best = next_best_view(belief, not_enrolled=decision.not_enrolled)
             match name:
                 case "dense":
-                    step = next_best_view(belief).rotation_deg
+                    step = best.rotation_deg
                 case "dense-coin":
-                    step = abs(next_best_view(belief).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
+                    step = abs(best.rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
                 case "dense-90":
                     step = 90.0
                 case _:

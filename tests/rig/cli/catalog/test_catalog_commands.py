@@ -78,9 +78,6 @@ def test_catalog_is_edited_and_every_change_is_logged(two: Rig) -> None:
     assert result(two("catalog", "gc", "--yes", "--json"))["views"] == 4
     assert two("catalog", "undelete", "tin").exit_code == 7
     assert "nothing to remove" in two("catalog", "gc").stdout
-    stats = result(two("catalog", "stats", "--json"))
-    assert (stats["objects"], stats["views"], stats["deleted_objects"]) == (1, 4, 0)
-    assert "views            4" in two("catalog", "stats").stdout
     log = [json.loads(line) for line in two("log", "--json").stdout.splitlines()]
     changes = [entry["action"] for entry in log]
     assert changes[0] == "imported"
