@@ -25,6 +25,7 @@ from rig.devices.camera import Camera
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
 from rig.devices.servo import Servo
+from rig.devices.trace import TraceWriter
 from rig.safety.saved_state import MemoryStore, SessionEnd, StateStore
 from rig.safety.supervisor import Safety
 
@@ -65,6 +66,8 @@ class Bench(AbstractContextManager["Bench"]):
         Stores the table's revolutions and faults for the next program.
     head
         The rig head that `imu` is connected to; None if `imu` is on the computer's own I2C bus.
+    trace
+        Records what `servo`, `imu`, `head` and `camera` exchange with their devices; None without ``config.trace``.
     connections
         Connections that must be closed after the devices.
     """
@@ -82,6 +85,7 @@ class Bench(AbstractContextManager["Bench"]):
     calibration_steps: NextSteps = field(default=(), init=False)
     state: StateStore = field(default_factory=MemoryStore, repr=False)
     head: RigHead | None = None
+    trace: TraceWriter | None = field(default=None, repr=False)
     connections: ExitStack = field(default_factory=ExitStack, repr=False)
     safety: Safety = field(init=False, repr=False)
     _imu: Imu | None = field(default=None, init=False, repr=False)
@@ -119,6 +123,7 @@ class Bench(AbstractContextManager["Bench"]):
             self.servo.close,
             *(device.close for device in (self._imu, self._camera) if device is not None),
             self.connections.close,
+            *((self.trace.close,) if self.trace else ()),
         ]
         for step in steps:
             try:

@@ -28,6 +28,7 @@ from rig.devices.imu import Imu, open_imu
 from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.opencv_capture import Capture
 from rig.devices.servo import Servo
+from rig.devices.trace import Device, TracedI2c, TracedSerial, TraceWriter
 from rig.safety.saved_state import BenchLock, FileStore, StateStore
 
 
@@ -115,14 +116,24 @@ def assemble(
     the table's limits.
     """
     with ExitStack() as opened:
+        trace: TraceWriter | None = None
+        if config.trace is not None:
+            trace = TraceWriter(config.trace, clock, name, config)
+            opened.callback(trace.close)
+
+        def traced(port: SerialConnection, device: Device = "servo") -> SerialConnection:
+            return port if trace is None else TracedSerial(port, trace, device)
+
         # Open the rig head and the servo.
         head: RigHead | None = None
         fault: RigError | None = None
         if config.imu.connection == "head" and head_port is not None:
-            head = open_head(config, head_port, clock)
+            port = head_port
+            head = open_head(config, lambda: traced(port(), "head"), clock)
             opened.callback(head.close)
             fault = head.switch_on(config.head)  # first, because the servo's supply may go through it
-        servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial, guardian)
+        again = reopen_serial and (lambda: traced(reopen_serial()))
+        servo = open_servo(traced(connection), config.servo, clock, config.table.mode, again, guardian)
         findings = servo.prepare(write=config.servo.write_settings)
         findings += tuple(f"servo: {one}" for one in servo.remarks)
         _check_reach(config, servo)
@@ -131,7 +142,9 @@ def assemble(
 
         # IMU and camera are opened at their first use, unless the head is the IMU.
         def open_sensor() -> Imu:
-            return open_imu(config.imu, i2c_bus, clock) if head is None else head
+            if head is not None:
+                return head
+            return open_imu(config.imu, i2c_bus if trace is None else TracedI2c(i2c_bus, trace), clock)
 
         def open_camera() -> Camera:
             with ExitStack() as failed:
@@ -158,6 +171,7 @@ def assemble(
 
         # Connect the safety layer with the devices.
         bench = Bench(name, config, clock, servo, open_sensor, open_camera, findings=findings, state=state, head=head)
+        bench.trace = trace
         bench.safety.connect()
         if head is not None:
             watched = head

@@ -157,6 +157,9 @@ class RigConfig(Section):
     calibration_dir: Path | None = Field(
         None, description="folder of the calibrations, with one folder for each bench; none: the user's data folder"
     )
+    trace: Path | None = Field(
+        None, description="new file that records what the bench exchanges with its devices; none: no recording"
+    )
     servo: ServoConfig = ServoConfig()
     table: TableConfig = TableConfig()
     safety: SafetyConfig = SafetyConfig()

@@ -243,7 +243,7 @@ class ObjectMoved(RigError, code=601, title="object moved"):
 
 
 class ReplayMismatch(RigError, code=602, title="replay mismatch"):
-    """A saved run leads to different decisions when it is computed again."""
+    """A saved run leads to different decisions when it is computed again, or devices differ from a trace."""
 
 
 class RunIncomplete(RigError, code=604, title="run incomplete"):

@@ -70,6 +70,7 @@ class Do(StrEnum):
         "write the settings of the servo, with its torque off",
         "rig servo settings --write",
     )
+    RECORD_TRACE = "record-trace", "record a trace", "rig servo record {file}"
     SERVO_ID = "servo-id", "give the servo the id {id}", "rig servo set-id {id}"
     SERVO_BAUD = "servo-baud", "set the baud rate of the servo", "rig servo set-baud {baud}"
     CALIBRATE = "calibrate", "run the calibration {name}", "rig calibrate {name}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import ControllerHangs, DeviceFault, DeviceSilent
-from rig.devices.i2c import I2cRegisters, I2cStatistics
+from rig.devices.i2c import AnyBus, I2cRegisters, I2cStatistics
 from rig.devices.imu import ImuIdentity, ImuSamples, identified
 
 Floats = NDArray[np.float64]
@@ -75,7 +75,7 @@ class Bno055:
     _newest_ns: int
     _owed_deg: Floats
 
-    def __init__(self, bus: int | str, *, clock: Clock, address: int = 0x28) -> None:
+    def __init__(self, bus: AnyBus, *, clock: Clock, address: int = 0x28) -> None:
         self._clock = clock
         self._registers = I2cRegisters(bus, address, clock)
         self._period_ns = round(1e9 / RATE_HZ)

@@ -45,21 +45,47 @@ class I2cStatistics:
     corrupt: int = 0
 
 
-class I2cRegisters:
-    """Registers of the device at ``address`` (7 bits) of ``bus``: its number, or the path of its device file.
+class I2cBus:
+    """A bus, opened by its number or by the path of its device file. Each transfer raises OSError if the bus fails.
 
     Raises `DeviceNotFound`: the bus cannot be opened.
     """
 
-    def __init__(self, bus: int | str, address: int, clock: Clock) -> None:
+    def __init__(self, bus: int | str) -> None:
         self.name = bus if isinstance(bus, str) else f"/dev/i2c-{bus}"
-        self.address = address
-        self.statistics = I2cStatistics()
-        self._clock = clock
         self._bus = _open(self.name)
 
     def close(self) -> None:
         self._bus.close()
+
+    def reopen(self) -> None:
+        """Open the bus again; raises `DeviceNotFound`."""
+        self._bus.close()
+        self._bus = _open(self.name)
+
+    def read(self, address: int, register: int, count: int) -> bytes:
+        if count <= _SMBUS_BLOCK:
+            return bytes(self._bus.read_i2c_block_data(address, register, count))
+        answer = i2c_msg.read(address, count)
+        self._bus.i2c_rdwr(i2c_msg.write(address, [register]), answer)
+        return bytes(answer)
+
+    def write(self, address: int, register: int, values: bytes) -> None:
+        self._bus.write_i2c_block_data(address, register, list(values))
+
+
+AnyBus = int | str | I2cBus
+
+
+class I2cRegisters:
+    """Registers of the device at ``address`` (7 bits) of ``bus``, which may be open already; errors as for `I2cBus`."""
+
+    def __init__(self, bus: AnyBus, address: int, clock: Clock) -> None:
+        self._bus = bus if isinstance(bus, I2cBus) else I2cBus(bus)
+        self.name, self.close = self._bus.name, self._bus.close
+        self.address = address
+        self.statistics = I2cStatistics()
+        self._clock = clock
 
     def read(self, register: int, count: int) -> bytes:
         """Return ``count`` bytes from ``register`` on, in one transfer; raises `DeviceSilent` as `transfer` does."""
@@ -67,14 +93,10 @@ class I2cRegisters:
 
     def read_once(self, register: int, count: int) -> bytes:
         """Return ``count`` bytes from ``register`` on; raises OSError if the bus fails."""
-        if count <= _SMBUS_BLOCK:
-            return bytes(self._bus.read_i2c_block_data(self.address, register, count))
-        answer = i2c_msg.read(self.address, count)
-        self._bus.i2c_rdwr(i2c_msg.write(self.address, [register]), answer)
-        return bytes(answer)
+        return self._bus.read(self.address, register, count)
 
     def write(self, register: int, *values: int) -> None:
-        self.transfer(lambda: self._bus.write_i2c_block_data(self.address, register, list(values)))
+        self.transfer(lambda: self._bus.write(self.address, register, bytes(values)))
 
     def transfer(self, transfer: Callable[[], _T]) -> _T:
         """Return the result of ``transfer``; repeat it if the bus fails.
@@ -87,8 +109,7 @@ class I2cRegisters:
             if attempt == ATTEMPTS:
                 if not controller_hangs(self.name, failures):
                     break
-                self._bus.close()
-                self._bus = _open(self.name)
+                self._bus.reopen()
             if attempt:
                 self.statistics.retries += 1
                 self._clock.sleep(RETRY_PAUSE_S)

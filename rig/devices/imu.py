@@ -12,6 +12,7 @@ from rig.config.imus import ImuKind, imu_kind, likely_device, recognised
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.core.next_steps import Do
+from rig.devices.i2c import AnyBus
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ class FifoTimes:
 class ImuDriver(Protocol):
     """Opens the sensor of a row of `rig.config.imus`; ``settings`` are the address and the row's settings by name."""
 
-    def __call__(self, bus: int | str, *, clock: Clock, **settings: Any) -> Imu: ...
+    def __call__(self, bus: AnyBus, *, clock: Clock, **settings: Any) -> Imu: ...
 
 
 def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_rthz: float) -> ImuIdentity:
@@ -130,8 +131,8 @@ def another_sensor(kind: ImuKind, got: int, address: int, bus: str) -> DeviceMis
     )
 
 
-def open_imu(config: ImuConfig, bus: int | str, clock: Clock) -> Imu:
-    """Open the sensor at ``config.address`` of ``bus`` (a number, or the path of a device file).
+def open_imu(config: ImuConfig, bus: AnyBus, clock: Clock) -> Imu:
+    """Open the sensor at ``config.address`` of ``bus``.
 
     Raises `ConfigError`, `DeviceNotFound`, `DeviceMismatch`, `DeviceFault`, `DeviceSilent`: the driver of a plug-in
     cannot be loaded; otherwise see the driver of the model.

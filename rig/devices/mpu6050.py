@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rig.config.imus import ImuKind, imu_kind
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, ControllerHangs, DeviceFault, DeviceMismatch, DeviceSilent
-from rig.devices.i2c import I2cRegisters, I2cStatistics
+from rig.devices.i2c import AnyBus, I2cRegisters, I2cStatistics
 from rig.devices.imu import FifoTimes, Imu, ImuIdentity, ImuSamples, identified
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
@@ -69,7 +69,7 @@ class Mpu6050:
 
     def __init__(
         self,
-        bus: int | str,
+        bus: AnyBus,
         *,
         clock: Clock,
         address: int = 0x68,

@@ -129,6 +129,7 @@ class OpenCvCamera:
         self._settings = settings or CameraConfig()
         self._missing = capture.get(_UNKNOWN_PROPERTY)
         self.modes = modes_of(capture)
+        self.controls: tuple[v4l2.VideoControl, ...] = capture.controls() if hasattr(capture, "controls") else ()
         self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
         self.returns = 0
         self._clock = clock

@@ -66,6 +66,10 @@ class V4l2Capture:
         """Return the smallest value and the step of a setting; None if the camera does not tell."""
         return v4l2.control_limits(self._path, _CONTROLS[propId]) if propId in _CONTROLS else None
 
+    def controls(self) -> tuple[v4l2.VideoControl, ...]:
+        """Return the controls that the camera offers."""
+        return v4l2.controls(self._path)
+
     def set(self, propId: int, value: float, /) -> bool:
         if propId < v4l2.FIRST_CONTROL:
             return self._capture.set(propId, value)

@@ -26,7 +26,8 @@ _VIDEO_CAPTURE, _DISCRETE = 1, 1
 _MOST_ENTRIES = 64  # a driver that never answers EINVAL must not hold the program
 _G_CTRL, _S_CTRL, _QUERYCTRL = 0xC008_561B, 0xC008_561C, 0xC044_5624
 _CONTROL = struct.Struct("Ii")
-_QUERY = struct.Struct("II32s4i3I")  # number, type, name; smallest, largest, step, default; flags, reserved
+_RANGE = struct.Struct("II32s4iI8x")  # number, type, name; minimum, maximum, step, default value; flags
+_NEXT, _DISABLED, _CLASS = 0x8000_0000, 0x0001, 6
 _CAPABILITY = struct.Struct("16s32s32s6I")  # driver, card, bus; version, capabilities of the driver and of this node
 
 
@@ -128,12 +129,40 @@ def get_control(path: Path, control: int) -> int | None:
     return None if answer is None else int(_CONTROL.unpack(answer)[1])
 
 
+@dataclass(frozen=True, slots=True)
+class VideoControl:
+    """A control that a camera offers, with its present value (None: it cannot be read)."""
+
+    number: int
+    name: str
+    minimum: int
+    maximum: int
+    step: int
+    default: int
+    value: int | None
+
+
+def controls(path: Path) -> tuple[VideoControl, ...]:
+    """Return the controls of a device, in the order of their numbers."""
+    found: list[VideoControl] = []
+    number = 0
+    while (answer := _ask(path, _QUERYCTRL, _RANGE.pack(number | _NEXT, 0, b"", 0, 0, 0, 0, 0))) is not None:
+        following, kind, name, low, high, step, default, flags = _RANGE.unpack(answer)
+        if following <= number:  # a driver that repeats itself
+            break
+        number = following
+        if kind != _CLASS and not flags & _DISABLED:
+            text = name.split(b"\0")[0].decode("ascii", "replace")
+            found.append(VideoControl(number, text, low, high, step, default, get_control(path, number)))
+    return tuple(found)
+
+
 def control_limits(path: Path, control: int) -> tuple[int, int] | None:
     """Return the smallest value and the step of a control; None if the device lacks it."""
-    answer = _ask(path, _QUERYCTRL, _QUERY.pack(control, 0, b"", *(0,) * 7))
+    answer = _ask(path, _QUERYCTRL, _RANGE.pack(control, 0, b"", 0, 0, 0, 0, 0))
     if answer is None:
         return None
-    smallest, _, step = _QUERY.unpack(answer)[3:6]
+    smallest, _, step = _RANGE.unpack(answer)[3:6]
     return int(smallest), int(step)
 
 

@@ -41,12 +41,7 @@ class SingleServo:
         self.table: ControlTable = control_table(self.found.model, self.found.firmware)
 
     def read(self) -> dict[str, int]:
-        """Return every register by name, in the order of addresses, without indirect addressing."""
-        registers = sorted(
-            {r.address: r for r in self.table.values() if not r.name.startswith("Indirect")}.values(),
-            key=lambda register: register.address,
-        )
-        return {register.name: self.bus.read(self.found.bus_id, register) for register in registers}
+        return self.bus.read_table(self.found.bus_id, self.table)
 
     def set_id(self, new: int) -> None:
         """Change the id of the servo.

@@ -110,11 +110,12 @@ def support_bundle(
     bench: str | None,
     open_catalog: Callable[[], Catalog],
     image_bgr: Callable[[], NDArray[np.uint8]] | None,
+    trace: Callable[[], bytes] | None = None,
 ) -> bytes:
     """Return a ZIP file for a person who helps without seeing the bench: findings, log, configuration and versions.
 
-    ``image_bgr`` takes an image of the camera for it. Passwords and tokens are masked. What cannot be read is left out;
-    the list ``missing`` in ``versions.json`` has the reason.
+    ``image_bgr`` takes an image of the camera for it, and ``trace`` records one. Passwords and tokens are masked. What
+    cannot be read is left out; the list ``missing`` in ``versions.json`` has the reason.
     """
 
     def log() -> bytes:
@@ -134,6 +135,8 @@ def support_bundle(
         parts["rig.toml"] = lambda: str(masked(file.read_text("utf-8"))).encode()
     if image_bgr is not None:
         parts["camera.png"] = lambda: encode(image_bgr())
+    if trace is not None:
+        parts["trace.jsonl"] = trace
     contents: dict[str, bytes] = {"findings.json": _masked_json(findings)}
     missing: list[str] = []
     for name, read in parts.items():

@@ -1,9 +1,11 @@
 """`rig doctor` and `rig find`, and what they share with `rig setup`: the bench to check, its findings, the progress."""
 
 import sys
+from collections import deque
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +16,7 @@ from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
-from rig.core.errors import UsageError, os_errors_as
+from rig.core.errors import RigError, UsageError, os_errors_as
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -41,6 +43,10 @@ def doctor(
         ),
     ] = None,
     picture: Annotated[bool, typer.Option("--picture", help="Add one image of the camera to the bundle.")] = False,
+    trace: Annotated[
+        bool,
+        typer.Option("--trace", help="Add what the devices send when they are opened, as rig servo record --still."),
+    ] = False,
 ) -> None:
     """Check everything that the bench needs. Print one finding per line, and a fix for each problem.
 
@@ -58,8 +64,8 @@ def doctor(
         return
     if bundle is not None:
         check_new(bundle, ".zip")
-    elif picture:
-        raise UsageError("--picture needs a bundle.", next_step="Add --bundle FILE.zip.")
+    elif picture or trace:
+        raise UsageError(f"--{'picture' if picture else 'trace'} needs a bundle.", next_step="Add --bundle FILE.zip.")
     found = print_findings(settings)
     if bundle is not None:
         image = (lambda: take(settings)[0].image_bgr) if picture else None
@@ -71,11 +77,27 @@ def doctor(
             settings.bench,
             partial(settings.open_catalog, read_only=True),
             image,
+            partial(still_trace, settings) if trace else None,
         )
         write_new(bundle, packed)
         print(f"Support bundle: {bundle}. Look through it before you send it.", file=sys.stderr)
     if found["exit_code"]:
         raise typer.Exit(found["exit_code"])
+
+
+def still_trace(settings: Settings) -> bytes:
+    """Return a trace for which nothing moves; if a device fails, it ends there."""
+    from rig.cli.ui.desk import CommandDesk
+    from rig.jobs.trace import record
+
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "trace.jsonl"
+        try:
+            deque(record(CommandDesk(settings.tracing(file)), still=True), maxlen=0)
+        except RigError:
+            if not file.exists():
+                raise
+        return file.read_bytes()
 
 
 def print_findings(settings: Settings) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """`rig servo ...`."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -8,15 +9,21 @@ from rig.cli.bench.doctor import doctor_context, show_progress
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption
-from rig.cli.ui.prompts import ask_yes_no
+from rig.cli.ui.prompts import ask_yes_no, confirm
 from rig.cli.ui.settings import Settings
+from rig.core.errors import ReplayMismatch
 from rig.core.next_steps import Do
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
     from rig.doctor.context import DoctorContext
     from rig.doctor.single_servo import SingleServo
 
-app = typer.Typer(help="Show the servo's registers, and change its settings, id and baud rate.", no_args_is_help=True)
+app = typer.Typer(
+    help="Show the servo's registers, change its settings, id and baud rate, and record a trace.", no_args_is_help=True
+)
+SHOWN: Final = 8
+"""Differences that an error lists without --json."""
 
 
 @app.command("info")
@@ -119,6 +126,71 @@ def set_baud(
     Example: rig servo set-baud 1000000 --bench sim --yes
     """
     _change(settings, "baud", rate, yes)
+
+
+@app.command("record")
+@command
+def record(
+    settings: Settings,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="New file for the trace.")],
+    still: Annotated[bool, typer.Option("--still", help="Move nothing.")] = False,
+    yes: YesOption = False,
+) -> None:
+    """Record what servo, IMU and camera send while the table rotates a little: to compare the simulated ones with them.
+
+    The table rotates by up to 45° and back, within its limits, and stops once on its way.
+
+    Example: rig servo record servo.jsonl --bench sim --yes
+    """
+    from rig.cli.ui.desk import CommandDesk
+    from rig.jobs.trace import REACH_DEG
+    from rig.jobs.trace import record as record_job
+
+    if not still:
+        confirm(f"The table rotates by up to {REACH_DEG:.0f}° and back.", yes=yes, settings=settings)
+    with doctor_context(settings) as context:
+        port = context.computer.serial_port(context.config.servo.port)
+    adapter = {key: port.usb.get(key) for key in ("idVendor", "idProduct")} if port else {}
+    desk = CommandDesk(settings.tracing(file))
+    desk.run(record_job(desk, still=still, adapter={**adapter, "latency_ms": port.latency_ms if port else None}))
+
+
+@app.command("replay")
+@command
+def replay_(
+    settings: Settings,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Trace from rig servo record.")],
+) -> None:
+    """Compare a trace with the drivers and with the simulated devices. Exit code 6 if something differs.
+
+    Example: rig servo replay servo.jsonl
+    """
+    from rig.devices.trace import read_trace
+    from rig.doctor.context import open_context
+    from rig.doctor.replay import replay_devices, replay_drivers
+
+    trace = read_trace(file)
+    # The sensor of a rig head is not compared, and the head would switch the servo's supply.
+    sensor = trace.config.imu.model_copy(update={"connection": "i2c"})
+    config = trace.config.model_copy(update={"bench": settings.load().bench, "imu": sensor})
+    with open_context("sim", config, seed=settings.seed) as context:
+        simulated = replay_devices(trace, context.computer)
+    results = {"driver": replay_drivers(trace).as_dict(), "simulator": simulated.as_dict()}
+    values = {"bench": trace.header.bench, "software": trace.header.software, "is_cut": trace.is_cut, **results}
+    lines = ["Its last line is cut off: the recording was interrupted."] * trace.is_cut
+    if times := results["simulator"]["reply_ms"]:
+        was, now = times["recorded"]["median"], times["now"]["median"]
+        lines.append(f"Replies of the servo: after {was:.1f} ms, of the simulated one after {now:.1f} ms.")
+    found = [f"{name}: {one}" for name, result in results.items() for one in result["differences"]]
+    if found:
+        more = [f"and {len(found) - SHOWN} more: --json"] * (len(found) > SHOWN)
+        raise ReplayMismatch(
+            " ".join([f"The trace {file} differs in {counted(len(found), 'field')}.", *lines]),
+            next_step="If a real device sent it, correct its driver or its simulation, or send the trace to us.",
+            evidence=values if settings.json else {"differences": found[:SHOWN] + more},
+        )
+    counts = [f"{counted(result['compared'], 'value')} against the {name}" for name, result in results.items()]
+    settings.say("\n".join([f"No difference: {', '.join(counts)}.", *lines]), values)
 
 
 def _change(settings: Settings, what: str, new: int, yes: bool) -> None:

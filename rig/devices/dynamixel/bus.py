@@ -16,7 +16,7 @@ from rig.core.errors import DeviceSilent, RequestRejected, UsageError
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.dynamixel.packets import PING, READ, REBOOT, WRITE, Packets, Packets1, Packets2, Reply, reason
 from rig.devices.dynamixel.port import BusBabble, ClockedPort
-from rig.devices.dynamixel.registers import Register
+from rig.devices.dynamixel.registers import ControlTable, Register
 
 OUTSTANDING_S = 2.0
 """How long a missing reply may still arrive: longer than any buffer can delay it."""
@@ -70,8 +70,10 @@ class DynamixelBus:
         self.protocol = protocol
         self.sampled_ns = 0
         """When the device began to send the last block that was read; it had sampled its registers just before."""
-        self._packets: Packets = Packets1() if protocol == 1 else Packets2()
+        self.packets: Packets = Packets1() if protocol == 1 else Packets2()
         self._retries = retries
+        self._accepted: Callable[[Reply], object] = getattr(port.ser, "accepted", lambda _: None)
+        """Called with each reply: for a trace."""
         self._lock = RLock()
         self._alerts: dict[int, int] = {}
         self._reads = 0
@@ -86,9 +88,9 @@ class DynamixelBus:
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
-        if self._packets.echo_sizes or self._is_outstanding(3):  # an echoed ping is a valid reply to itself
+        if self.packets.echo_sizes or self._is_outstanding(3):  # an echoed ping is a valid reply to itself
             return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
-        answer = self._transact("ping", (device_id,), lambda: self._ask(device_id, PING, b"", 3))[device_id]
+        answer = self._transact("ping", (device_id,), lambda: self.ask(device_id, PING, b"", 3))[device_id]
         return int.from_bytes(answer.data[:2], "little")
 
     def read(self, device_id: int, register: Register) -> int:
@@ -101,7 +103,7 @@ class DynamixelBus:
         already or arrives before the reply to the second reading; then both are discarded.
         """
         data, self.sampled_ns = self._read_once(device_id, address, size)
-        if dated or not (self._packets.undated or self._repeats_replies()):
+        if dated or not (self.packets.undated or self._repeats_replies()):
             return data
         counts = self.statistics
         for _ in range(CONFIRM_ATTEMPTS):
@@ -116,7 +118,7 @@ class DynamixelBus:
     def _drop_foreign(self) -> bool:
         """Drop what arrived after the last reply; return whether a reply or the beginning of one is among it."""
         waiting = self.port.getBytesAvailable()
-        data, start = self.port.ser.read(waiting) if waiting else b"", self._packets.start
+        data, start = self.port.ser.read(waiting) if waiting else b"", self.packets.start
         found = any(data[i:].startswith(start) or start.startswith(data[i:]) for i in range(len(data)))
         if found:
             self._foreign_ns = self.port.clock.now_ns()
@@ -134,12 +136,20 @@ class DynamixelBus:
             nonlocal skipped
             start, asked = self._unambiguous(address, size)
             skipped = address - start
-            return self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
+            return self.ask(device_id, READ, self.packets.read_parameters(start, asked), asked)
 
         reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
         # The reply ended just now, and took its length at the baud rate.
         sent_ns = reply.size * _BITS * 1_000_000_000 // self.port.baudrate
         return reply.data[skipped : skipped + size], self.port.clock.now_ns() - sent_ns
+
+    def read_table(self, device_id: int, table: ControlTable) -> dict[str, int]:
+        """Return every register by name, in the order of addresses, without indirect addressing."""
+        registers = sorted(
+            {r.address: r for r in table.values() if not r.name.startswith("Indirect")}.values(),
+            key=lambda register: register.address,
+        )
+        return {register.name: self.read(device_id, register) for register in registers}
 
     def write(self, device_id: int, register: Register, value: int, *, answered: bool = True) -> None:
         """Write a register; with ``answered`` False do not wait for a reply, which the servo may be set not to send."""
@@ -147,13 +157,13 @@ class DynamixelBus:
 
         def attempt() -> Answers:
             doubtful = self._is_outstanding(0) or self._repeats_replies()  # an earlier reply may look like this one
-            parameters = self._packets.write_parameters(register.address, data)
-            answers = self._ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
+            parameters = self.packets.write_parameters(register.address, data)
+            answers = self.ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
             reply = answers[0].get(device_id)
             if reply is None or reply.error or not doubtful:
                 return answers
             start, asked = self._unambiguous(register.address, register.size)
-            replies, result = self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
+            replies, result = self.ask(device_id, READ, self.packets.read_parameters(start, asked), asked)
             skipped = register.address - start
             if result == COMM_SUCCESS and replies[device_id].data[skipped : skipped + register.size] == data:
                 return answers
@@ -166,11 +176,11 @@ class DynamixelBus:
 
         Raises `UsageError`: Protocol 1.0 does not have this instruction.
         """
-        if not self._packets.reboots:
+        if not self.packets.reboots:
             raise UsageError(
                 "A servo with Protocol 1.0 cannot be restarted over its bus.", next_step="Switch its supply off and on."
             )
-        self._transact("reboot", (device_id,), lambda: self._ask(device_id, REBOOT, b"", 0))
+        self._transact("reboot", (device_id,), lambda: self.ask(device_id, REBOOT, b"", 0))
 
     def close(self) -> None:
         self.port.closePort()
@@ -203,7 +213,7 @@ class DynamixelBus:
                     rejected = next((reply for reply in replies.values() if reply.error), None)
                     if rejected is None:
                         return replies
-                    if rejected.error != self._packets.corrupted:
+                    if rejected.error != self.packets.corrupted:
                         self.statistics.rejected += 1
                         raise self._rejected(what, rejected)
                     result, replies = COMM_RX_CORRUPT, {}  # the instruction was damaged on its way: send it again
@@ -221,7 +231,7 @@ class DynamixelBus:
             )
             raise self._silent(what, missing or device_ids, reason(result), advice)
 
-    def _ask(
+    def ask(
         self, target: int, instruction: int, parameters: bytes, size: int, answering: Sequence[int] | None = None
     ) -> Answers:
         """Send an instruction to ``target``; wait for replies with ``size`` parameters, from it or from ``answering``.
@@ -234,23 +244,23 @@ class DynamixelBus:
         self._drop_foreign()
         ambiguous = size > 0 and self._is_outstanding(0)
         self._outstanding += [(size, self.port.clock.now_ns())] * max(len(answering), 1)
-        result = self._packets.send(self.port, target, instruction, parameters)
+        result = self.packets.send(self.port, target, instruction, parameters)
         if result != COMM_SUCCESS:
             return {}, result
-        self.port.setPacketTimeout(self._packets.reply_size(size) * len(answering))
+        self.port.setPacketTimeout(self.packets.reply_size(size) * len(answering))
         # Collect the replies, and leave out what belongs to no request of ours.
         replies: dict[int, Reply] = {}
         doubtful: dict[int, Reply] = {}
         while len(replies) < len(answering):
-            reply, result = self._packets.receive(self.port)
+            reply, result = self.packets.receive(self.port)
             if reply is None:
                 replies = doubtful | replies
-                return replies, COMM_SUCCESS if len(replies) == len(answering) else result
+                break
             if reply.bus_id not in answering:
                 self.statistics.foreign += 1
             elif reply.error and not reply.data and ambiguous:
                 doubtful[reply.bus_id] = reply
-            elif self._packets.echo_sizes and reply.data == parameters and len(parameters) not in (0, size):
+            elif self.packets.echo_sizes and reply.data == parameters and len(parameters) not in (0, size):
                 pass  # the adapter's echo of the instruction
             elif len(reply.data) != size and not (reply.error and not reply.data):
                 self.statistics.late += 1
@@ -258,7 +268,9 @@ class DynamixelBus:
             else:
                 replies[reply.bus_id] = reply
                 del self._outstanding[[one for one, _ in self._outstanding].index(size)]
-        return replies, COMM_SUCCESS
+        for reply in replies.values():
+            self._accepted(reply)
+        return replies, COMM_SUCCESS if len(replies) == len(answering) else result
 
     def _is_outstanding(self, size: int) -> bool:
         """Return whether a reply with ``size`` parameters may still arrive."""
@@ -270,9 +282,9 @@ class DynamixelBus:
 
     def _unambiguous(self, address: int, size: int) -> tuple[int, int]:
         """Return start and size of a read that includes ``size`` bytes at ``address`` and has an unambiguous reply."""
-        asked = size + min(self._reads % self._packets.read_lengths, address)
+        asked = size + min(self._reads % self.packets.read_lengths, address)
         self._reads += 1
-        while self._is_outstanding(asked) or asked in self._packets.echo_sizes:
+        while self._is_outstanding(asked) or asked in self.packets.echo_sizes:
             asked += 1
         return max(address - (asked - size), 0), asked
 
@@ -291,7 +303,7 @@ class DynamixelBus:
         )
 
     def _rejected(self, what: str, reply: Reply) -> RequestRejected:
-        reason = self._packets.rejections.get(reply.error, f"error {reply.error}")
+        reason = self.packets.rejections.get(reply.error, f"error {reply.error}")
         return RequestRejected(
             f"Servo {reply.bus_id} rejected the {what}: {reason}.",
             next_step=(Do.STATUS(), "A tripped watchdog or a hardware error prevents motion."),

@@ -88,6 +88,13 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     def write_parameters(self, address: int, data: bytes) -> bytes:
         return address.to_bytes(2, "little") + data
 
+    def instruction(self, packet: bytes) -> tuple[int, int, bytes]:
+        """Return id, instruction and parameters of a packet from `send`; ValueError for other bytes."""
+        if len(packet) < 10 or not packet.startswith(_HEADER):
+            raise ValueError(f"{packet.hex()} is no instruction")
+        whole = self.removeStuffing(list(packet))
+        return whole[4], whole[7], bytes(whole[8:-2])
+
     def addStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802 - the SDK's names
         """Stuff ``packet`` in place: the SDK's own version makes a new list, which its `txPacket` ignores."""
         return _restuff(packet, bytes(packet[7:-2]).replace(_HEADER, _STUFFED))
@@ -143,6 +150,11 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
 
     def write_parameters(self, address: int, data: bytes) -> bytes:
         return bytes((address,)) + data
+
+    def instruction(self, packet: bytes) -> tuple[int, int, bytes]:
+        if len(packet) < 6 or not packet.startswith(self.start):
+            raise ValueError(f"{packet.hex()} is no instruction")
+        return packet[2], packet[4], packet[5:-1]
 
 
 Packets = Packets1 | Packets2

@@ -218,6 +218,10 @@ class DynamixelServo:
     def bus_statistics(self) -> dict[str, int]:
         return asdict(self.bus.statistics)
 
+    def read_table(self) -> dict[str, int]:
+        """Return every register by name."""
+        return self.bus.read_table(self._id, self._table)
+
     # -- permanent settings -------------------------------------------------------------------------------------------
 
     def prepare(self, *, write: bool) -> tuple[str, ...]:

@@ -148,9 +148,10 @@ def test_doctor_writes_a_support_bundle_with_a_picture_only_if_asked(rig):
         assert versions["packages"]["numpy"] == np.__version__
         assert any(text.startswith("log.json: ") for text in versions["missing"])  # there is no catalog yet
     assert rig("doctor", "--bundle", "a.zip").exit_code == 2
-    assert rig("doctor", "--picture").exit_code == 2
-    assert rig("doctor", "--bundle", "b.zip", "--picture", "--json").exit_code == 0
+    assert rig("doctor", "--picture").exit_code == rig("doctor", "--trace").exit_code == 2
+    assert rig("doctor", "--bundle", "b.zip", "--picture", "--trace", "--json").exit_code == 0
     with ZipFile("b.zip") as bundle:
+        assert {json.loads(line).get("on") for line in bundle.read("trace.jsonl").splitlines()} >= {"servo", "imu"}
         assert bundle.read("camera.png").startswith(b"\x89PNG")
 
 

@@ -1,0 +1,148 @@
+"""`rig servo record` and `rig servo replay`: a trace of the simulated bench is that of the simulated bench."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+import sim.servo.models
+from rig.cli.main import app
+from tests.small import SMALL
+
+Rig = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A trace of the simulated bench, whose IMU has a number that could be secret."""
+    file = tmp_path_factory.mktemp("trace") / "bench.jsonl"
+    port = ("--set", "servo.port=/dev/serial/by-id/usb-FTDI_FT4NZSECRET")
+    small = [word for setting in SMALL for word in ("--set", setting)]
+    done = CliRunner().invoke(app, ["servo", "record", str(file), "--bench", "sim", "--yes", *port, *small])
+    assert done.exit_code == 0, done.output
+    assert f"Recorded {file}" in done.output
+    return file.read_bytes()
+
+
+@pytest.fixture
+def trace(rig: Rig, recorded: bytes) -> Rig:
+    Path("bench.jsonl").write_bytes(recorded)
+    return rig
+
+
+def differences(done: Result) -> list[str]:
+    assert done.exit_code == 6, done.output
+    evidence = json.loads(done.stdout)["evidence"]
+    return [f"{kind}: {one}" for kind in ("driver", "simulator") for one in evidence[kind]["differences"]]
+
+
+def test_a_trace_of_the_simulated_bench_has_no_difference(trace: Rig, recorded: bytes):
+    done = trace("servo", "replay", "bench.jsonl", "--json")
+    assert done.exit_code == 0, done.output
+    values = json.loads(done.stdout)
+    assert values["driver"]["compared"] > 300
+    assert values["simulator"]["compared"] > 1000
+    times = values["simulator"]["reply_ms"]
+    assert times["now"]["median"] == pytest.approx(times["recorded"]["median"], rel=0.01)
+    assert b"SECRET" not in recorded
+    lines = [json.loads(line) for line in recorded.splitlines()]
+    assert lines[0]["trace"] == 1
+    devices = {line["on"]: line["notes"] for line in lines[1:] if "notes" in line}
+    assert devices.keys() == {"servo", "imu", "camera"}
+    assert devices["imu"]["samples"] > 100
+
+
+def test_a_register_that_differs_is_named(trace: Rig, monkeypatch: pytest.MonkeyPatch):
+    models = sim.servo.models.MODELS
+    other = replace(models["xl430_w250"], initial={**models["xl430_w250"].initial, "Position P Gain": 650})
+    monkeypatch.setattr(sim.servo.models, "MODELS", {**models, "xl430_w250": other})
+    (found,) = differences(trace("servo", "replay", "bench.jsonl", "--json"))
+    assert re.fullmatch(
+        r"simulator: servo Position P Gain at \d\.\d+ s: recorded 640, now 650 \((\d+) of \1 differ\)", found
+    )
+    shown = trace("servo", "replay", "bench.jsonl")
+    assert shown.exit_code == 6
+    assert "recorded 640, now 650" in shown.output
+
+
+def test_a_slower_servo_shows_in_angle_and_speed(trace: Rig, monkeypatch: pytest.MonkeyPatch):
+    models = sim.servo.models.MODELS
+    slow = replace(models["xl430_w250"], no_load_dps=30.0)
+    monkeypatch.setattr(sim.servo.models, "MODELS", {**models, "xl430_w250": slow})
+    found = " ".join(differences(trace("servo", "replay", "bench.jsonl", "--json")))
+    assert "servo Present Position" in found
+    assert "servo Present Velocity" in found
+
+
+def test_a_driver_that_reads_other_values_is_noticed(trace: Rig, recorded: bytes):
+    before = b'"reply":{"bus_id":1,"error":0,"alert":0,"data":"24042e"'
+    assert before in recorded
+    Path("other.jsonl").write_bytes(recorded.replace(before, before.replace(b"2e", b"2f"), 1))
+    found = differences(trace("servo", "replay", "other.jsonl", "--json"))
+    assert found[0].startswith("driver: servo reply at 0.000 s: recorded ")
+
+
+def test_an_imu_with_another_identity_is_noticed(trace: Rig, recorded: bytes):
+    identity = b'"read":"68","address":117'
+    assert identity in recorded
+    Path("other.jsonl").write_bytes(recorded.replace(identity, identity.replace(b"68", b"70")))
+    found = " ".join(differences(trace("servo", "replay", "other.jsonl", "--json")))
+    assert "driver: imu " in found
+    assert "simulator: imu register 0x75 at" in found
+    assert "recorded 112, now 104" in found
+
+
+def test_a_recording_that_was_killed_is_readable(trace: Rig, recorded: bytes):
+    Path("cut.jsonl").write_bytes(recorded[:9000])
+    done = trace("servo", "replay", "cut.jsonl")
+    assert done.exit_code == 0, done.output
+    assert "Its last line is cut off" in done.output
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"garbage\n", b'{"trace":2}\n', b"\xff\n"])
+def test_garbage_is_an_error_with_a_next_step(rig: Rig, content: bytes):
+    Path("garbage.jsonl").write_bytes(content)
+    done = rig("servo", "replay", "garbage.jsonl")
+    assert done.exit_code == 2
+    assert "garbage.jsonl is no trace that this program can read: its line 1 is wrong." in done.output
+    assert "Next step: Restore the file" in done.output
+    assert rig("servo", "replay", "missing.jsonl").exit_code == 2
+
+
+def test_a_damaged_line_is_named(trace: Rig, recorded: bytes):
+    lines = recorded.splitlines(keepends=True)
+    lines[7] = lines[7].replace(b'"t_ns":', b'"t_ns":-')
+    Path("damaged.jsonl").write_bytes(b"".join(lines))
+    done = trace("servo", "replay", "damaged.jsonl")
+    assert done.exit_code == 2
+    assert "its line 8 is wrong" in done.output
+    Path("model.jsonl").write_bytes(recorded.replace(b'"model":"xl430_w250"', b'"model":"none"', 1))
+    assert trace("servo", "replay", "model.jsonl").exit_code == 3
+
+
+def test_record_asks_before_it_moves_and_overwrites_nothing(rig: Rig):
+    assert rig("servo", "record", "trace.jsonl").exit_code == 2  # there is no terminal to ask on
+    assert not Path("trace.jsonl").exists()
+    assert rig("servo", "record", "trace.jsonl", "--still").exit_code == 0
+    content = Path("trace.jsonl").read_bytes()
+    done = rig("servo", "record", "trace.jsonl", "--still")
+    assert done.exit_code == 2
+    assert "Give a new file" in done.output
+    assert Path("trace.jsonl").read_bytes() == content
+
+
+def test_any_command_can_be_recorded(rig: Rig):
+    assert rig("goto", "20", "--set", "trace='goto.jsonl'").exit_code == 0
+    assert rig("servo", "replay", "goto.jsonl").exit_code == 0
+
+
+def test_a_missing_imu_does_not_end_the_recording(rig: Rig):
+    done = rig("servo", "record", "servo.jsonl", "--yes", "--set", 'bench.sim.faults=["imu.off", "camera.off"]')
+    assert done.exit_code == 0, done.output
+    assert "The trace has no imu." in done.output
+    assert "The trace has no camera." in done.output
+    assert rig("servo", "replay", "servo.jsonl").exit_code == 0
