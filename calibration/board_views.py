@@ -80,7 +80,7 @@ def take_views(
                 seen = detect_board(board, captured.image_bgr)
                 foreign |= set(seen.marker_ids.tolist()) - known
                 elsewhere += seen.marker_ids.size >= MIN_MARKERS and not seen.ids.size
-                if seen.ids.size >= MIN_CORNERS:
+                if seen.ids.size >= min(MIN_CORNERS, board.corners):
                     views.append(BoardView(number, table.rest_deg, seen.ids, seen.corners_px))
                 index += 1
                 yield Progress(index / planned, _words(seen, board, views, bench))

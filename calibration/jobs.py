@@ -106,6 +106,19 @@ def imu(
     return GyroScale(revolutions), ImuMounting(), GyroRotation(repeats)
 
 
+@_titled("Ringing of the platter")
+def shaper(
+    stops: Annotated[int, typer.Option(help="Stops after which the platter is listened to.")] = 10,
+) -> "Sequence[Procedure]":
+    """Calibrate how the platter rings after a stop; from then on, moves do not excite it. Put a usual object on it.
+
+    Example: rig calibrate shaper --bench sim
+    """
+    from calibration.procedures import Ringing
+
+    return (Ringing(stops),)
+
+
 @_titled("Camera (board)")
 def camera(columns: BoardColumns = 8, rows: BoardRows = 6, square_mm: SquareMm = 15.0) -> "Sequence[Procedure]":
     """Calibrate the lens of the camera with the printed board.
@@ -212,18 +225,34 @@ def everything(
     return (
         *servo.procedures(),
         *imu.procedures(),
+        *shaper.procedures(),
         *camera.procedures(columns, rows, square_mm),
         *table.procedures(columns, rows, square_mm, radius_mm, height_mm, middle_mm, lens_mm),
         *(noise.procedures(thing) if thing is not None else ()),
     )
 
 
+@_titled("Home mark (card)")
+def mark(columns: BoardColumns = 4, rows: BoardRows = 3, square_mm: SquareMm = 15.0) -> "Sequence[Procedure]":
+    """Calibrate the home mark: a small card at a fixed place of the platter, by which rig home finds the angle.
+
+    Print the card with rig calibrate table --print-board and the same options. Calibrate the camera first.
+
+    Example: rig calibrate mark --bench sim
+    """
+    from calibration.procedures import HomeMark
+
+    return (HomeMark(_board(columns, rows, square_mm)),)
+
+
 CALIBRATIONS = {
     "servo": servo,
     "cable": cable,
     "imu": imu,
+    "shaper": shaper,
     "camera": camera,
     "table": table,
+    "mark": mark,
     "camera-time": camera_time,
     "noise": noise,
     "all": everything,

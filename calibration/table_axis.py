@@ -173,7 +173,7 @@ def evaluate(
         values = {"found": len(views), "span_deg": span, "needed": MIN_VIEWS, "needed_deg": MIN_SPAN_DEG}
         return found.reject(RejectionCode.TOO_FEW_VIEWS, **values)
     matrix, distortion = matrix_of(intrinsics)
-    poses = [_pose(board, view, matrix, distortion) for view in views]
+    poses = [pose(board, view, matrix, distortion) for view in views]
     reject_loose_board(found, views, poses)
     axis = _Axis(views, board, intrinsics, poses)
     found.estimates, found.residual = axis.fit()
@@ -223,7 +223,7 @@ class _Axis:
         self._corners_px = np.concatenate([view.corners_px for view in views])
         self._middle = board.points_mm().mean(axis=0)
         self._stands = sorted({view.stand for view in views})
-        self._up, self._origin = _first_axis(views, poses, self._middle)
+        self._up, self._origin = first_axis(views, poses, self._middle)
         # Two directions across the axis, in which the point on the axis may move and the axis may lean.
         first = np.cross(self._up, [0.0, 0.0, 1.0])
         first /= np.linalg.norm(first)
@@ -324,13 +324,13 @@ class _Axis:
         return np.concatenate([corners, CORNER_PX * (p[6:FIRST_POSE] - self._known) / self._known_sigma])
 
 
-def _pose(board: CharucoBoard, view: BoardView, matrix: Floats, distortion: Sequence[float]) -> tuple[Floats, Floats]:
+def pose(board: CharucoBoard, view: BoardView, matrix: Floats, distortion: Sequence[float]) -> tuple[Floats, Floats]:
     """Return rotation vector and translation (mm) of the board in the camera's frame."""
     _, rotation, translation = cv2.solvePnP(points(board, view), view.corners_px, matrix, np.array(distortion))
     return np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
 
 
-def _first_axis(
+def first_axis(
     views: Sequence[BoardView], poses: Sequence[tuple[Floats, Floats]], middle: Floats
 ) -> tuple[Floats, Floats]:
     """Return direction and a point of the axis, from the rotations between poses and the circles of the middles."""

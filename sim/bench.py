@@ -17,7 +17,7 @@ from rig.config import RigConfig, Section
 from rig.core.clock import SystemClock
 from rig.core.errors import ObjectNotFound, UsageError
 from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
-from sim.calibration_board import boards
+from sim.calibration_board import HOME_MARK, boards, home_mark
 from sim.camera import CAMERA_DEVICE
 from sim.change import Change
 from sim.clock import PacedClock, VirtualClock
@@ -40,6 +40,7 @@ class SimOptions(Section):
         None, description="object on the table to identify, or a list that is repeated; default: random, from the seed"
     )
     yaw_deg: float | None = Field(None, ge=-360, le=360, description="its rotation; default: random, from the seed")
+    mark: bool = Field(False, description="whether the card of the home mark stands on the platter")
     speed: float | None = Field(
         None, gt=0, le=1000, description="simulated seconds per second; default: as fast as the computer can"
     )
@@ -127,6 +128,9 @@ class ShelfOperator:
                 self.queue.rotate(-1)
             name = self.next_object or drawn
             yaw_deg = drawn_deg if self.yaw_deg is None else self.yaw_deg
+        if name == HOME_MARK:
+            self.world.change(mark=home_mark(self.optics))
+            return
         if name in self.targets:
             self.world.put(self.targets[name])
             return
@@ -274,6 +278,8 @@ class SimBenchKind:
             operator = stage.operator(new_world(options, seed, rest_angle_deg(config, state)))
             operator.next_object = options.object if isinstance(options.object, str) else None
             operator.yaw_deg = options.yaw_deg
+            if options.mark:
+                operator.place(HOME_MARK)
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
             bench = open_sim_bench(

@@ -134,6 +134,14 @@ def _texture(board: CharucoBoard) -> NDArray[np.uint8]:
     return np.asarray(cv2.LUT(board.picture(TEXTURE_PX_MM), _LEVELS))
 
 
+HOME_MARK = "home-mark"
+
+
+def home_mark(optics: Optics) -> BoardOnPlatter:
+    """Return the card of the home mark: it stands at the edge of the platter, and faces the camera at home."""
+    return BoardOnPlatter(CharucoBoard(4, 3), optics, tilt_deg=10.0, centre_mm=(0.0, -55.0, 30.0), name=HOME_MARK)
+
+
 def boards(optics: Optics) -> dict[str, BoardOnPlatter]:
     """Return the board in each position that calibrations need, by name."""
     layout = CharucoBoard()

@@ -370,6 +370,12 @@ class SimCapture:
 
     def _picture(self, scene: Scene, table_deg: float, rows: tuple[int, int] = (0, HEIGHT)) -> Image:
         """Return the image of a scene under nominal light; only the ``rows`` need to be right."""
+        image = self._without_mark(scene, table_deg, rows)
+        if isinstance(scene.mark, BoardOnPlatter):  # it stands in front of the object while it faces the camera
+            scene.mark.draw(image, -table_deg if self.orbits else table_deg, rows=rows)
+        return image
+
+    def _without_mark(self, scene: Scene, table_deg: float, rows: tuple[int, int]) -> Image:
         table_deg = -table_deg if self.orbits else table_deg
         in_room = self.orbits and self._draws_bench
         empty = room(self._world.seed, table_deg) if in_room else self.backdrop

@@ -33,13 +33,15 @@ class Scene:
     """The scene before the camera, apart from the table's angle.
 
     ``yaw_deg`` is the object's counter-clockwise rotation relative to the platter, ``offset_mm`` the position of its
-    axis in the platter's frame, ``light`` the light relative to the nominal light, as B, G, R.
+    axis in the platter's frame, ``light`` the light relative to the nominal light, as B, G, R, ``mark`` the card of the
+    home mark.
     """
 
     object: SimObject | None = None
     yaw_deg: float = 0.0
     offset_mm: tuple[float, float] = (0.0, 0.0)
     light: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    mark: SimObject | None = None
 
 
 class Activity(Enum):

@@ -52,6 +52,18 @@ class RejectionCode(Enum):
         "The rotation by {distance_deg:.0f}° took {seconds:.2f} s, {residual_s:.2f} s off the others: something "
         "hindered it, or shook the bench. Check the cable and the platter, and calibrate again."
     )
+    NO_RINGING = (
+        "After a stop the platter moves by {peak_dps:.2f} °/s at most, and the gyro's noise is {noise_dps:.2f} °/s: it "
+        "does not ring, and its moves need no other profile."
+    )
+    RINGING_UNCLEAR = (
+        "The rate after a stop differs from one decaying oscillation by {residual:.1f} times the noise: keep hands and "
+        "other machines off the bench. If the object on the table rocks, fasten it."
+    )
+    RINGING_UNCERTAIN = (
+        "The platter rings at {hz:.1f} Hz with an uncertainty of {uncertainty_hz:.2f} Hz, more than 2 %. Give more "
+        "stops."
+    )
     CABLE_ENDS_SWAPPED = (
         "The counter-clockwise end ({high_deg:.0f}°) lies below the clockwise end ({low_deg:.0f}°): the ends were "
         "shown in the wrong order, or table.direction has the wrong sign. Check the direction with the "

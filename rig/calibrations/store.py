@@ -26,7 +26,7 @@ CALIBRATIONS = "calibrations"
 """The key in a bench's conditions that names the results in force."""
 
 
-_COMMANDS = {"camera.time": "camera-time"}
+_COMMANDS = {"camera.time": "camera-time", "table.ringing": "shaper", "table.mark": "mark"}
 """Commands that are not named after the first part of their results."""
 
 

@@ -3,7 +3,7 @@
 from rig.config.device_sections import CameraConfig, CameraTimeConfig, HeadConfig, ImuConfig, ServoConfig
 from rig.config.schema import CatalogConfig, EnrollConfig, IdentifyConfig, RigConfig, ViewConfig, load_config
 from rig.config.section import Section
-from rig.config.table_sections import MAX_LIMIT_DEG, SafetyConfig, TableConfig
+from rig.config.table_sections import MAX_LIMIT_DEG, MarkConfig, SafetyConfig, TableConfig
 
 __all__ = [
     "MAX_LIMIT_DEG",
@@ -14,6 +14,7 @@ __all__ = [
     "HeadConfig",
     "IdentifyConfig",
     "ImuConfig",
+    "MarkConfig",
     "RigConfig",
     "SafetyConfig",
     "Section",

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from rig.config.catalog_place import CatalogPlace
 from rig.config.device_sections import CameraConfig, CameraTimeConfig, HeadConfig, ImuConfig, ServoConfig
 from rig.config.section import Section
-from rig.config.table_sections import SafetyConfig, TableConfig
+from rig.config.table_sections import MarkConfig, SafetyConfig, TableConfig
 from rig.config.values import APP, read_values, validate
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -162,6 +162,7 @@ class RigConfig(Section):
     )
     servo: ServoConfig = ServoConfig()
     table: TableConfig = TableConfig()
+    mark: MarkConfig = MarkConfig()
     safety: SafetyConfig = SafetyConfig()
     imu: ImuConfig = ImuConfig()
     head: HeadConfig = HeadConfig()

@@ -58,6 +58,14 @@ class TableConfig(Section):
     orientation: Literal["encoder", "imu"] = Field(
         "encoder", description="source of a view's angle: the servo's encoder, or only the gyro on the platter"
     )
+    ringing_hz: float = Field(
+        0.0,
+        ge=0,
+        le=200,
+        description="frequency at which the platter rings after a stop, from calibration; moves then do not excite it; "
+        "0: not known",
+    )
+    ringing_damping: float = Field(0.05, ge=0.001, le=0.9, description="damping ratio of that ringing")
     quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
@@ -90,6 +98,21 @@ class TableConfig(Section):
     def orientation_sign(self) -> int:
         """Sign of the camera's azimuth around the object: −1 if the table angle θ rotates the object, else +1."""
         return 1 if self.carries == "camera" else -1
+
+
+class MarkConfig(Section):
+    """The home mark, from calibration: a card on the platter that shows the table's angle to the camera."""
+
+    card: tuple[int, int, float, float] = Field(
+        (0, 0, 0.0, 0.0), description="columns, rows, side of a square and of a marker in mm; no columns: there is none"
+    )
+    camera: tuple[float, float, float, float, float, float, float, float] = Field(
+        (0.0,) * 8, description="fx, fy, cx, cy, k1, k2, p1 and p2 of the camera that saw it"
+    )
+    rotation: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="rotation vector of the card in the camera's frame at home"
+    )
+    axis: tuple[float, float, float] = Field((0.0, 0.0, 1.0), description="the table's axis in the camera's frame")
 
 
 class SafetyConfig(Section):

@@ -98,6 +98,10 @@ class Servo(Protocol):
         """Angle of one encoder count."""
 
     @property
+    def profile_units(self) -> MotionProfile:
+        """Smallest steps of a profile's speed and acceleration."""
+
+    @property
     def revolution_deg(self) -> float:
         """Angle after which the encoder repeats; without supply, the servo loses the count of these."""
 

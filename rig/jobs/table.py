@@ -7,17 +7,26 @@ from typing import Final
 from rig.bench import Bench
 from rig.catalog import Action
 from rig.config import MAX_LIMIT_DEG
-from rig.core.errors import RigError, UsageError
-from rig.core.phrases import angle_words, signed
+from rig.core.errors import RigError, Unreferenced, UsageError
+from rig.core.next_steps import Do, SomeSteps
+from rig.core.phrases import angle_words, counted, signed
 from rig.jobs.desk import Desk, JobResult, Remark, Steps
 from rig.motion.turntable import Turntable
 from rig.plans.jog import JogKey
 from rig.plans.jog import jog as jog_table
 from rig.plans.operator import Choice, Question, Subject
 from rig.plans.steps import announced, moved
+from rig.safety.angle_reference import AngleFinding, SavedAngleCheck
+from rig.views.charuco_board import CharucoBoard, detect_board
+from rig.views.home_mark import mark_angle_deg
 
 DEVICES: Final = ("imu",)
 """The devices that a rotation needs besides the servo."""
+OTHERWISE: Final[dict[Subject, SomeSteps]] = {
+    Subject.LONG_WAY: (),
+    Subject.REVOLUTION: ("Otherwise leave it, and give its revolutions:", Do.SET_REVOLUTIONS(revolutions=0)),
+}
+"""What the operator may do instead of an answer."""
 LEAVE: Final = {Choice.CONTINUE: "rotate", Choice.STOP: "leave it"}
 
 
@@ -32,21 +41,59 @@ def goto(desk: Desk, angle_deg: float) -> Steps[None]:
 def home(desk: Desk, *, revolutions: int | None = None) -> Steps[bool]:
     """Rotate the table to home, after ``revolutions`` were set as by `refer`; return whether it may.
 
-    The operator is asked before a rotation by more than half a revolution that follows from ``revolutions``.
+    If the angle is in doubt and the home mark is calibrated, the camera sees the angle within the revolution, and the
+    operator is asked for the revolution only. The operator is also asked before a rotation by more than half a
+    revolution that follows from ``revolutions``.
     """
     with desk.open_bench(DEVICES) as bench:
+        safety, seen_deg, subject = bench.safety, None, Subject.LONG_WAY
+        if safety.doubt and bench.config.mark.card[0]:
+            seen_deg = _seen_deg(bench, safety.doubt, required=revolutions is None)
+            if seen_deg is not None and revolutions is None:
+                subject, revolutions = Subject.REVOLUTION, round((_last_deg(bench, safety.doubt) - seen_deg) / 360.0)
         if revolutions is not None:
-            position_deg = bench.servo.read_state().position_deg
-            angle_deg = bench.safety.angle_reference.with_revolutions(position_deg, revolutions)
-            if abs(angle_deg) > 180.0 and not bench.safety.beyond_limits(angle_deg):
-                text = (
-                    f"The table is then at {angle_words(angle_deg, 0)} and rotates by {signed(-angle_deg, 0)}° to home."
-                )
-                if desk.operator.choose(Question(Subject.LONG_WAY, text, LEAVE, default=Choice.STOP)) is Choice.STOP:
-                    return False
-            bench.safety.set_revolutions(revolutions)
+            if seen_deg is not None:
+                angle_deg = seen_deg + 360.0 * revolutions
+            else:
+                position_deg = bench.servo.read_state().position_deg
+                angle_deg = safety.angle_reference.with_revolutions(position_deg, revolutions)
+            text = f"The table is then at {angle_words(angle_deg, 0)} and rotates by {signed(-angle_deg, 0)}° to home."
+            if subject is Subject.REVOLUTION:
+                text = f"Look at the cable. Is it wound up by {counted(revolutions, 'revolution')}? {text}"
+            question = Question(subject, text, LEAVE, default=Choice.STOP, steps=OTHERWISE[subject])
+            asks = subject is Subject.REVOLUTION or abs(angle_deg) > 180.0
+            if asks and not safety.beyond_limits(angle_deg) and desk.operator.choose(question) is Choice.STOP:
+                return False
+            if seen_deg is None:
+                safety.set_revolutions(revolutions)
+            else:
+                safety.set_angle(angle_deg)
         yield from _rotated(desk, bench, 0.0)
     return True
+
+
+def _seen_deg(bench: Bench, doubt: SavedAngleCheck, *, required: bool) -> float | None:
+    """Return the table's angle within a revolution by the home mark; None if that is not seen and not required."""
+    image_bgr = bench.camera.capture(bench.clock.now_ns()).image_bgr
+    angle_deg = mark_angle_deg(detect_board(CharucoBoard(*bench.config.mark.card), image_bgr), bench.config.mark)
+    if angle_deg is None and required:
+        raise Unreferenced(
+            f"The table's angle is in doubt: {doubt}. The camera does not see the home mark at its place.",
+            next_step=(
+                "Rotate the table by hand, with the servo's supply on, until the card faces the camera.",
+                Do.RUN_AGAIN(),
+                "Or look at the cable. If it hangs free,",
+                Do.SET_REVOLUTIONS(revolutions=0),
+                "If the card or the camera was moved, calibrate the mark again afterwards.",
+            ),
+        )
+    return angle_deg
+
+
+def _last_deg(bench: Bench, doubt: SavedAngleCheck) -> float:
+    """Return the last known angle of the table, from which the cable is probably not far; 0 if there is none."""
+    unknown = AngleFinding.NEVER_REFERENCED, AngleFinding.OTHER_SERVO, AngleFinding.SETTINGS_CHANGED
+    return 0.0 if doubt.finding in unknown else bench.safety.angle_reference.to_table(doubt.saved_position_deg)
 
 
 def _rotated(desk: Desk, bench: Bench, angle_deg: float) -> Steps[None]:

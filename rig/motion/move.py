@@ -68,8 +68,9 @@ def equivalent_within(target_deg: float, rest_deg: float, limits_deg: tuple[floa
     return min(angles_deg, key=lambda angle_deg: abs(angle_deg - rest_deg), default=None)
 
 
-SETTLING_MS: Final = 220.0
-"""Time of a move for ringing and for the bus; before and after it, the table is quiet for ``table.quiet_s``."""
+SETTLING_MS, SHAPED_MS = 220.0, 120.0
+"""Time of a move for ringing and for the bus; before and after it, the table is quiet for ``table.quiet_s``. The second
+is that of a shaped move (`rig.motion.shaper`), which takes longer itself."""
 FRAMES: Final = 1.5
 """Frames from the table's rest until one was exposed completely."""
 
@@ -84,7 +85,9 @@ class MotionTimes:
         """Return the duration of a move until the table is at rest; downwards it includes the approach from below."""
         table = self.config.table
         profile = MotionProfile(table.velocity_dps, table.acceleration_dps2)
-        seconds = (SETTLING_MS + 2e3 * table.quiet_s) / 1e3 + motion_seconds(distance_deg, profile)
+        seconds = ((SHAPED_MS if table.ringing_hz else SETTLING_MS) + 2e3 * table.quiet_s) / 1e3 + motion_seconds(
+            distance_deg, profile
+        )
         if distance_deg < 0:
             seconds += motion_seconds(table.approach_deg, profile) + 2 * table.poll_s
         return seconds

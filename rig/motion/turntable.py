@@ -3,12 +3,16 @@
 Decision: docs/decisions/0005.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from math import copysign, isfinite, remainder
 from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.core.clock import seconds_between
@@ -19,6 +23,8 @@ from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
 from rig.motion.arrival import Arrival, MotionPath, causes_found, halt, quiet_deg
 from rig.motion.move import FIRST_REST_S, Move, equivalent_within, motion_seconds
+from rig.motion.shaper import shaped
+from rig.motion.traces import KEPT, MoveTrace, store
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.safety.gyro_rotation import GyroRotationMeter, Stillness, compare
 from rig.safety.motion_checks import MotionMonitor, SlipMonitor
@@ -26,6 +32,10 @@ from rig.safety.supervisor import Motion, TableState
 
 SETTLE_ALLOWANCE_S = 2.5  # larger: a table that shakes is reported late; smaller: a heavy object never rests in time
 """Time for ringing to die down and for a slow bus, in addition to the motion."""
+ROUND_S = 0.03  # longer: a shaped motion is watched less closely; shorter: its parts begin late
+"""Longest time that a round of the control loop takes besides its pause."""
+GYRO_LAG_S = 0.012
+"""Time after a stop until the low-pass filter of a gyro (42 Hz) shows it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +66,16 @@ class Flight:
 
 @dataclass(slots=True)
 class _Rotation:
-    """The beginning of a rotation, and what checks it; the table stays if there is no ``monitor``."""
+    """The beginning of a rotation, and what checks it; the table stays if there is no ``monitor``.
+
+    ``due`` are times at which the control loop must read, and what it does before.
+    """
 
     started_ns: int
     start_deg: float
     slip: SlipMonitor | None = None
     monitor: MotionMonitor | None = None
+    due: deque[tuple[int, Callable[[], object]]] = field(default_factory=deque)
 
 
 class Turntable(AbstractContextManager["Turntable"]):
@@ -78,6 +92,11 @@ class Turntable(AbstractContextManager["Turntable"]):
         How long the gyro is averaged for its first bias.
     changes
         Settings of the section ``table`` that differ from those of the bench. Calibrations change them.
+
+    Attributes
+    ----------
+    moves
+        Traces of the last moves.
     """
 
     def __init__(
@@ -95,19 +114,21 @@ class Turntable(AbstractContextManager["Turntable"]):
             bench.imu, bench.clock, axis=imu.axis, sign=imu.sign, scale=imu.scale, scale_sigma=imu.scale_uncertainty
         )
         self._profile: MotionProfile | None = None
-        self._rest_deg = 0.0
+        self._usual = MotionProfile(self._config.velocity_dps, self._config.acceleration_dps2)
+        self._rest_deg = self._shaft_deg = 0.0
         self._path = MotionPath((0.0, 0.0), self._config.velocity_dps)
         self._arrival_at = partial(Arrival, self._servo, self._gyro, self._clock, self._config)
         self._backlash_taken_up = False
+        self._state = bench.state
+        self.moves: deque[MoveTrace] = deque(maxlen=KEPT)
+        self._gyro.taps.append(self._trace_samples)
 
     def __enter__(self) -> Self:
         self._safety.prepare()
         try:
             self._servo.torque_on()
             # After torque on, which clears the watchdog: a watchdog that trips resets the profile to unlimited.
-            self._profile = self._servo.set_profile(
-                MotionProfile(self._config.velocity_dps, self._config.acceleration_dps2)
-            )
+            self._profile = self._usual = self._servo.set_profile(self._usual)
             self._wait_for_rest(self.angle_deg(), self._config.quiet_s, SETTLE_ALLOWANCE_S)
             self._learn_bias(self._first_rest_s)
         except BaseException:
@@ -127,6 +148,9 @@ class Turntable(AbstractContextManager["Turntable"]):
             except RigError:
                 if error is None or isinstance(error, KeyboardInterrupt | SystemExit):  # the first error is reported
                     raise
+            finally:
+                if self.moves:
+                    store(self._state, self.moves)
 
     @property
     def rest_deg(self) -> float:
@@ -203,11 +227,9 @@ class Turntable(AbstractContextManager["Turntable"]):
         with self._safety.motion((rotation.start_deg, *waypoints), self._stop) as motion:
             with causes_found(self._servo, self._limits):
                 for goal_deg in waypoints:
-                    rotation.monitor = self._monitor(self._rest_deg, goal_deg)
-                    self._servo.arm_watchdog(self._config.watchdog_s)
-                    self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
                     # The table must rest only at the last stop; at the others it is enough to arrive.
                     quiet_s = self._config.quiet_s if goal_deg is waypoints[-1] else 0.0
+                    self._start(goal_deg, quiet_s, rotation)
                     self._wait_for_rest(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg), rotation)
             self._arrive(motion)
         return self._end(rotation, target_deg)
@@ -238,7 +260,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 with causes_found(self._servo, self._limits):
                     rotation.monitor = self._monitor(self._rest_deg, target_deg)
                     self._servo.arm_watchdog(self._config.watchdog_s)
-                    self._safety.set_goal(self._safety.angle_reference.to_servo(target_deg))
+                    self._set_goal(target_deg)
                     target_deg = self._wait_in_flight(target_deg, flight, rotation)
                 self._arrive(motion)
             return self._end(rotation, target_deg)
@@ -307,9 +329,8 @@ class Turntable(AbstractContextManager["Turntable"]):
     @contextmanager
     def _recorded(self, flight: Flight) -> Iterator[None]:
         """Set the speed of a flight and give its recorder the gyro's samples; afterwards set the usual speed again."""
-        usual = self._torque_profile()
-        if abs(flight.velocity_dps - usual.velocity_dps) > 1e-3:
-            self._profile = self._servo.set_profile(MotionProfile(flight.velocity_dps, usual.acceleration_dps2))
+        usual = self._usual
+        self._use(MotionProfile(flight.velocity_dps, usual.acceleration_dps2))
         self._gyro.taps.append(flight.recorder.add_samples)
         try:
             yield
@@ -329,13 +350,81 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._learn_bias(self._config.quiet_s)  # the bias drifts, so each rest measures it again
         self._gyro.begin()
         if ends_deg:
+            bias_dps, _ = self._gyro.bias_of_table
+            utc = self._clock.utc().isoformat(timespec="seconds")
+            self.moves.append(MoveTrace(utc, rotation.started_ns, self._rest_deg, bias_dps))
             path_deg = [self._safety.angle_reference.to_servo(angle) for angle in (self._rest_deg, *ends_deg)]
             self._path = MotionPath((min(path_deg), max(path_deg)), self._config.velocity_dps)
             rotation.slip = SlipMonitor(self._limits, self._rest_deg) if self._trust_gyro else None
         return rotation
 
+    def _start(self, goal_deg: float, quiet_s: float, rotation: _Rotation) -> None:
+        """Start a motion; if the platter's ringing is known, one that does not excite it."""
+        config, clock = self._config, self._clock
+        plan, rotation.due = None, deque()
+        if config.ringing_hz:
+            step_deg = self._servo.resolution_deg  # the servo rounds its goal; a hundredth of a degree matters
+            shaft_deg = round(self._safety.angle_reference.to_servo(goal_deg) / step_deg) * step_deg
+            plan = shaped(shaft_deg - self._shaft_deg, self._usual, self._servo.profile_units, config)
+        asked_ns = clock.now_ns()
+        if plan is None:
+            self._use(self._usual)
+        else:
+            self._profile = self._servo.set_profile(plan.cruise)
+        asking_s = seconds_between(asked_ns, clock.now_ns())
+        rotation.monitor = self._monitor(self._rest_deg, goal_deg)
+        self._servo.arm_watchdog(config.watchdog_s)
+        begun_ns = clock.now_ns()
+        self._set_goal(goal_deg)
+        if plan is None:
+            return
+
+        def slow_down() -> None:
+            self._use(plan.slow)
+            clock.sleep(plan.slow_s - seconds_between(begun_ns, clock.now_ns()))
+            self._set_goal(goal_deg)
+
+        # The readings at the end follow the motion closely, so that a table at rest is not waited for.
+        ends_s = plan.seconds + GYRO_LAG_S
+        quiet_s += ends_s + GYRO_LAG_S / 4
+        times_s = (ends_s, quiet_s, quiet_s + plan.rings_s)
+        if plan.slow != plan.cruise:
+            rotation.due.append((begun_ns + round((plan.slow_s - asking_s) * 1e9), slow_down))
+        rotation.due.extend((begun_ns + round(after_s * 1e9), lambda: None) for after_s in times_s)
+
+    def _pause(self, rotation: _Rotation | None) -> None:
+        """Wait for the next round of the control loop."""
+        config, clock = self._config, self._clock
+        if rotation is not None and rotation.due:
+            at_ns, act = rotation.due[0]
+            left_s = seconds_between(clock.now_ns(), at_ns)
+            if left_s < config.poll_s + ROUND_S:
+                rotation.due.popleft()
+                clock.sleep(left_s)
+                act()
+                return
+        clock.sleep(config.poll_s)
+
+    def _use(self, profile: MotionProfile) -> None:
+        """Set the servo's profile, unless it has this one."""
+        now = self._torque_profile()
+        if (
+            max(abs(profile.velocity_dps - now.velocity_dps), abs(profile.acceleration_dps2 - now.acceleration_dps2))
+            > 1e-3
+        ):
+            self._profile = self._servo.set_profile(profile)
+
+    def _set_goal(self, goal_deg: float) -> None:
+        self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
+        self.moves[-1].goals.append((self._clock.now_ns(), goal_deg, self._torque_profile()))
+
+    def _trace_samples(self, time_ns: NDArray[np.int64], rate_dps: NDArray[np.float64]) -> None:
+        if self.moves:
+            self.moves[-1].add_samples(time_ns, rate_dps)
+
     def _arrive(self, motion: Motion) -> None:
         self._servo.disarm_watchdog()
+        self.moves[-1].settled_ns = self._clock.now_ns()
         motion.arrived(self._safety.angle_reference.to_servo(self._rest_deg))
         self._backlash_taken_up = True
 
@@ -388,7 +477,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         """
         arrival, rest_deg = self._arrival_at(goal_deg, quiet_s, allowed_s), None
         while rest_deg is None:
-            self._clock.sleep(self._config.poll_s)
+            self._pause(rotation)
             state, angle_deg = self._read()
             self._check(state, angle_deg, rotation)
             rest_deg = arrival.rest_deg(state, angle_deg)
@@ -408,7 +497,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             flight.recorder.add_reading(state.sampled_ns or state.time_ns, angle_deg)
             if abs(next_deg - goal_deg) > self._config.tolerance_deg / 2:
                 goal_deg = next_deg
-                self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
+                self._set_goal(goal_deg)
                 # If the goal is behind the table, it overshoots before it comes back.
                 stop_deg = self.stopping_deg(state)
                 farthest_deg = stop_deg if abs(stop_deg - goal_deg) > abs(angle_deg - goal_deg) else angle_deg
@@ -426,8 +515,14 @@ class Turntable(AbstractContextManager["Turntable"]):
         for observer in self._safety.observers:
             observer(state)
         self._path.add(state)
+        self._shaft_deg = state.position_deg if state.trajectory_deg is None else state.trajectory_deg
         self._gyro.update(now=gyro_now)
-        return state, self._safety.angle_reference.to_table(state.position_deg)
+        to_table = self._safety.angle_reference.to_table
+        angle_deg = to_table(state.position_deg)
+        if self.moves and self.moves[-1].settled_ns is None:
+            profile_deg = None if state.trajectory_deg is None else to_table(state.trajectory_deg)
+            self.moves[-1].add_reading(state, angle_deg, profile_deg)
+        return state, angle_deg
 
     def _check(self, state: ServoState, angle_deg: float, rotation: _Rotation | None) -> None:
         """Check the servo, and the rotation if there is one."""

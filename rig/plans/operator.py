@@ -34,6 +34,8 @@ class Subject(StrEnum):
     """The table must be empty for its image."""
     LONG_WAY = "long-way"
     """The table would rotate by more than half a revolution."""
+    REVOLUTION = "revolution"
+    """The home mark shows the table's angle, but not by how many revolutions the cable is wound up."""
     CALIBRATION = "calibration"
     """A step of a calibration needs the operator."""
 

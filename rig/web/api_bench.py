@@ -128,6 +128,12 @@ def add_bench(routes: Routes, server: Server) -> None:
             raise JobNotFound("The camera has given no frame yet.", next_step="Try again in a second.")
         return Jpeg(content, headers={"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"})
 
+    @routes.watch.get("/moves/last", tags=["bench"])
+    def get_last_move() -> dict[str, Any]:
+        """Return the last move of the last job that ended: encoder, servo profile, load and gyro over its time."""
+        values: dict[str, Any] = server.remote.ask("last_move")
+        return values
+
 
 async def _send_events(server: Server, socket: WebSocket) -> None:
     """Send the hub's messages to a page until it has gone or may not listen any more."""

@@ -115,6 +115,7 @@ class BenchSide:
             "candidates": self._candidates,
             "picture": self._picture,
             "numbers": self._numbers,
+            "last_move": self.worker.last_move,
         }
 
     def publish(self, kind: str, data: Any) -> None:

@@ -11,10 +11,11 @@ from typing import Any, Final
 
 from rig.bench import Bench
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
 from rig.core.next_steps import steps_as_json
 from rig.devices.servo import ServoState
+from rig.motion.traces import stored
 from rig.safety.stop_channel import StopAnswer, StopListener
 from rig.safety.supervisor import stopped
 from rig.web.jobs import JobQueue
@@ -189,6 +190,13 @@ class BenchWorker:
             self._bench, self._error = bench, None
             self._read_status()
         return self._bench
+
+    def last_move(self) -> dict[str, Any]:
+        """Return the trace of the last move as JSON values. Raises `JobNotFound`: there is none."""
+        moves = stored(self._bench.state) if self._bench is not None else []
+        if not moves:
+            raise JobNotFound("The table has not moved yet.", next_step="Rotate it, then ask again.")
+        return moves[-1]
 
     def close(self, error: BaseException | None = None) -> None:
         """Close the bench; ``error`` is why."""

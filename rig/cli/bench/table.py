@@ -59,6 +59,8 @@ def home(
 ) -> None:
     """Rotate the table to home (0°). If its revolutions are in doubt, look at the cable and give --revolutions.
 
+    With a calibrated home mark, the camera sees the angle within the revolution: you only confirm the revolution.
+
     Example: rig home --revolutions 0 --bench sim
     """
     from rig.cli.ui.desk import CommandDesk

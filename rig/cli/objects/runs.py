@@ -1,4 +1,4 @@
-"""`rig replay` and `rig report`: read what `rig identify --save-run` has saved."""
+"""`rig replay` and `rig report`: read what `rig identify --save-run` has saved, and what the bench keeps of moves."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -7,7 +7,8 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
-from rig.core.errors import ReplayMismatch, RunIncomplete
+from rig.core.errors import ReplayMismatch, RunIncomplete, UsageError
+from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
@@ -58,23 +59,48 @@ def replay(
 @command
 def report(
     settings: Settings,
-    run: RunArgument,
+    run: Annotated[Path | None, typer.Argument(metavar="RUN", help="Folder of a saved run.")] = None,
+    motion: Annotated[bool, typer.Option("--motion", help="Draw the last moves of the table instead.")] = False,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="File to write (default: report.html in the run's folder).")
+        Path | None,
+        typer.Option(metavar="FILE", help="File to write (default: report.html in the run's folder, or motion.html)."),
     ] = None,
 ) -> None:
     """Write an HTML page about a saved run: the answer, the camera's path, the scores, the views and the decisions.
 
+    With --motion, the page shows the last moves of the table: angle, rate, ringing and load.
+
     Example: rig report runs/1 --out run-1.html
     """
     from rig.report import write_report
-    from rig.report.report import run_report
-    from rig.search.saved_run import load_run
 
-    page = run_report(load_run(run))
-    path = out or run / "report.html"
+    if motion == (run is not None):
+        raise UsageError("One report at a time is written.", next_step="Give the folder of a saved run, or --motion.")
+    if run is None:
+        page, path = _motion(settings), out or Path("motion.html")
+    else:
+        from rig.report.report import run_report
+        from rig.search.saved_run import load_run
+
+        page, path = run_report(load_run(run)), out or run / "report.html"
     write_report(path, page)
     settings.say(f"Report: {path}", {"report": str(path)})
+
+
+def _motion(settings: Settings) -> str:
+    """Return the page about the last moves of the bench, which may be in use."""
+    from rig.motion.traces import stored
+    from rig.report.motion import motion_report
+    from rig.safety.saved_state import FileStore
+
+    config, bench = settings.load(), settings.bench_name
+    moves = stored(FileStore(config.state_path(bench)))
+    if not moves:
+        raise UsageError(
+            f"The bench {bench} has stored no move yet.",
+            next_step=(Do.GOTO(), "A simulated bench stores its moves if state_dir is set."),
+        )
+    return motion_report(moves, bench=bench, quiet_dps=config.table.quiet_dps)
 
 
 def _check(settings: Settings, saved: "SavedRun") -> None:

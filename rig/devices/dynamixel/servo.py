@@ -215,6 +215,10 @@ class DynamixelServo:
         return low, high
 
     @property
+    def profile_units(self) -> MotionProfile:
+        return MotionProfile(self._dps_per_unit, self._dps2_per_unit)
+
+    @property
     def bus_statistics(self) -> dict[str, int]:
         return asdict(self.bus.statistics)
 

@@ -166,7 +166,10 @@ def test_fault_is_latched_shown_and_acknowledged(serve):
 
 def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
     served = serve()
+    assert served.client.get("/api/v1/moves/last").status_code == 404
     served.run(kind="goto", angle_deg=90)
+    move = served.client.get("/api/v1/moves/last").json()
+    assert (move["to_deg"], round(move["encoder_deg"][-1]), move["goals"][-1][1]) == (90, 90, 90)
     assert served.run(kind="reference")["error"]["code"] == 200
     assert served.run(kind="reference", revolutions=5)["error"]["code"] == 200  # beyond the cable budget
     assert served.run(kind="reference", revolutions=-1)["state"] == "done"
@@ -180,7 +183,7 @@ def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
 def test_calibrations_are_offered_and_others_rejected(serve):
     served = serve()
     offered = served.client.get("/api/v1/calibrations").json()["available"]
-    assert set(offered) == {"servo", "imu", "camera", "camera-time", "table", "noise"}
+    assert set(offered) == {"servo", "imu", "shaper", "mark", "camera", "camera-time", "table", "noise"}
     assert served.run(kind="calibrate", name="nothing")["error"]["code"] == 200
     assert served.run(kind="calibrate", name="noise")["error"]["code"] == 200
 

@@ -1,0 +1,162 @@
+"""Measure how the platter rings after a stop, by its own gyro: frequency and damping.
+
+After the end of the servo's profile, the rate of the platter is a decaying oscillation about the gyro's bias:
+
+    r(t) = exp(−ζωt)·(A·cos(ω_d·t) + B·sin(ω_d·t)) + c,    ω_d = ω·√(1 − ζ²)
+
+All stops have the same ω and ζ, and each its own A, B and c, which follow by linear least squares. The uncertainties
+come from fits without one of the stops (jackknife). `rig.motion.shaper` uses the result.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from calibration.procedure import Evaluation, Measured, Procedure, lower_end, require_at_least, returning
+from rig.bench import Bench
+from rig.calibrations import CalibrationResult, RejectionCode
+from rig.charts.xy import MODEL, Axis, Chart, Series
+from rig.motion.move import motion_seconds
+from rig.motion.traces import MoveTrace
+from rig.motion.turntable import Turntable
+from rig.plans.steps import moved
+
+NAME = "table.ringing"
+
+Floats = NDArray[np.float64]
+
+SWING_DEG = 20.0  # a start and a stop at full acceleration, with a pause between them
+MIN_STOPS = 4  # fewer do not show a scatter
+LISTEN_S = 2.0  # longer: more noise; shorter: the slowest ringing does not die down
+DELAYS_S = (0.015, 0.03, 0.05, 0.08)
+"""Times after the end of the profile from which the rate is fitted: a shaft that lags behind stops later."""
+HZ, DAMPING = np.geomspace(3.0, 40.0, 80), np.array([0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4])
+"""Where the fit begins."""
+MAX_RESIDUAL = 3.0
+"""Largest scatter about the fit, in that of its end: more is a second oscillation, or a hand."""
+MIN_PEAK = 6.0  # a smaller one does not determine a frequency
+"""Smallest rate after a stop, in the scatter of the end."""
+MAX_UNCERTAINTY = 0.02
+"""Largest relative uncertainty of the frequency: with twice as much, a shaped motion rings by a tenth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """The rate of the platter after the end of a profile: times in seconds and rates in °/s, (n,)."""
+
+    time_s: Floats
+    rate_dps: Floats
+
+    @classmethod
+    def of(cls, trace: MoveTrace) -> "Stop":
+        """Return the stop of a move, from the end of its profile on."""
+        begun_ns, goal_deg, profile = trace.goals[-1]
+        end_ns = begun_ns + round(motion_seconds(goal_deg - trace.from_deg, profile) * 1e9)
+        time_ns, rate_dps = trace.gyro()
+        after = (time_ns > end_ns) & (time_ns < end_ns + LISTEN_S * 1e9)
+        return cls(((time_ns[after] - end_ns) * 1e-9).astype(np.float64), rate_dps[after])
+
+    def since(self, delay_s: float) -> "Stop":
+        return Stop(self.time_s[self.time_s >= delay_s], self.rate_dps[self.time_s >= delay_s])
+
+
+def plot(result: CalibrationResult) -> Chart | None:
+    """Return a chart of the rate after the first stop, measured and fitted."""
+    if "frequency" not in result.estimates:
+        return None
+    shown = result.evidence["stop"]
+    return Chart(
+        f"Ringing after a stop: {result.estimates['frequency']}, damping {result.estimates['damping']}",
+        Axis("seconds after the servo's profile", span=(0.0,)),
+        Axis("°/s"),
+        [
+            Series("model", shown["time_s"], shown["model_dps"], MODEL, dots=False, curve=True),
+            Series("measured", shown["time_s"], shown["rate_dps"]),
+        ],
+    )
+
+
+@dataclass(frozen=True)
+class Ringing(Procedure):
+    """A procedure that stops the table ``stops`` times, and listens to the platter."""
+
+    names, title, devices, valid_days, plots = (NAME,), "ringing of the platter", ("servo", "imu"), 180, (plot,)
+    stops: int
+
+    def __post_init__(self) -> None:
+        require_at_least(MIN_STOPS, self.stops, "stops")
+
+    def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
+        stops = []
+        with Turntable(bench, approach_deg=0.0, ringing_hz=0.0, quiet_dps=10.0) as table:
+            base_deg = lower_end(bench, table.rest_deg, SWING_DEG)
+            with returning(table) as goto:
+                goto(base_deg)
+                for index in range(self.stops):
+                    move = goto(base_deg + (SWING_DEG if index % 2 == 0 else 0.0))
+                    for _round in range(round(LISTEN_S / 0.2)):  # less than a sensor's FIFO holds
+                        bench.clock.sleep(0.2)
+                        table.collect_gyro()
+                    stops.append(Stop.of(table.moves[-1]))
+                    yield moved(index, move)
+        yield evaluate(stops)
+
+
+def evaluate(stops: Sequence[Stop]) -> Evaluation:
+    """Fit frequency and damping to the rates after ``stops``."""
+    found = Evaluation(name=NAME, residual_unit="σ", limit=MAX_RESIDUAL)
+    # A shaft that lags behind its profile still moves at first: then the model fits only later.
+    for delay_s in DELAYS_S:
+        used = [stop.since(delay_s) for stop in stops]
+        hz, damping = _fit(used)
+        squares = np.square(_residuals(used, hz, damping))
+        noise_dps = sqrt(float(squares[np.concatenate([stop.time_s for stop in used]) > 0.8 * LISTEN_S].mean()))
+        found.residual = residual = sqrt(float(squares.mean())) / noise_dps
+        if residual <= MAX_RESIDUAL / 2:
+            break
+    peak_dps = float(np.median([np.abs(stop.rate_dps - stop.rate_dps[-20:].mean()).max() for stop in used]))
+    found.evidence = {"stops": len(stops), "delay_s": delay_s, "noise_dps": noise_dps, "peak_dps": peak_dps}
+    if peak_dps < MIN_PEAK * noise_dps:
+        return found.reject(RejectionCode.NO_RINGING, peak_dps=peak_dps, noise_dps=noise_dps)
+    without = np.array([_fit([*used[:i], *used[i + 1 :]], (hz, damping)) for i in range(len(used))])
+    sigma = np.sqrt((len(used) - 1) * without.var(axis=0))
+    found.estimate("frequency", hz, sigma[0], "Hz")
+    found.estimate("damping", damping, sigma[1])
+    first = used[0]
+    found.evidence["stop"] = {
+        "time_s": first.time_s.round(4).tolist(),
+        "rate_dps": first.rate_dps.round(3).tolist(),
+        "model_dps": (first.rate_dps - _residuals([first], hz, damping)).round(3).tolist(),
+    }
+    found.proposed = {"table.ringing_hz": round(hz, 3), "table.ringing_damping": round(damping, 4)}
+    found.reject_if(residual > MAX_RESIDUAL, RejectionCode.RINGING_UNCLEAR, residual=residual)
+    found.reject_if(
+        sigma[0] > MAX_UNCERTAINTY * hz, RejectionCode.RINGING_UNCERTAIN, hz=hz, uncertainty_hz=float(sigma[0])
+    )
+    return found
+
+
+def _fit(stops: Sequence[Stop], start: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Return frequency and damping; without a start, from the best of a grid."""
+    if start is None:
+        grid = [(float(hz), float(damping)) for hz in HZ for damping in DAMPING]
+        start = min(grid, key=lambda at: float(np.square(_residuals(stops[:2], *at)).sum()))
+    solved = least_squares(
+        lambda p: _residuals(stops, *p), start, bounds=((1.0, 0.001), (80.0, 0.9)), x_scale=(start[0], 0.05)
+    )
+    return float(solved.x[0]), float(solved.x[1])
+
+
+def _residuals(stops: Sequence[Stop], hz: float, damping: float) -> Floats:
+    """Return the deviations of all rates from the model with the best amplitudes and biases."""
+    parts = []
+    for stop in stops:
+        t = stop.time_s
+        swing = np.exp(2 * pi * hz * complex(-damping, sqrt(1 - damping**2)) * t)
+        design = np.column_stack([swing.real, swing.imag, np.ones_like(t)])
+        parts.append(stop.rate_dps - design @ np.linalg.lstsq(design, stop.rate_dps, rcond=None)[0])
+    return np.concatenate(parts)

@@ -1,0 +1,86 @@
+"""The ringing of the platter: true within its uncertainty, and moves that do not excite it settle at once."""
+
+import numpy as np
+import pytest
+
+from calibration.procedure import Evaluation
+from calibration.ringing import Ringing, Stop, evaluate
+from rig.calibrations import RejectionCode
+from rig.core.errors import MotionTimeout, UsageError
+from rig.motion.turntable import Turntable
+from sim.noise import NoiseModel
+from tests.calibration.rejected import codes
+from tests.rig.bench_parts import motion_bench
+
+TABLES = [(6.0, 0.02), (6.0, 0.2), (9.0, 0.06), (13.0, 0.15), (20.0, 0.02), (20.0, 0.1)]
+"""Frequency and damping of the simulated platter."""
+TARGETS_DEG = (40.0, 85.0, 95.0, 190.0, 150.0, 20.0)
+
+
+def drawn(rng: np.random.Generator, hz: float, damping: float) -> list[Stop]:
+    time_s = np.arange(0.0, 2.0, 0.005)
+    swing = np.exp(2 * np.pi * hz * complex(-damping, np.sqrt(1 - damping**2)) * time_s)
+    phases = 2.0 * np.exp(1j * rng.uniform(0, 6.28, 8))
+    return [Stop(time_s, (phase * swing).real + rng.normal(0, 0.04, time_s.size)) for phase in phases]
+
+
+def settling_s(bench, world, **ringing) -> list[float]:
+    """Return the times from the end of the shaft's motion until the table counts as at rest."""
+    found = []
+    with Turntable(bench, **ringing) as table:
+        for target in TARGETS_DEG:
+            table.goto(target)
+            rest_s = table.moves[-1].readings[-1][0] * 1e-9
+            found.append(rest_s - world._motions[-1][1].shaft.end_s)
+            assert abs(table.rest_deg - target) < 0.2
+    return found
+
+
+@pytest.mark.parametrize(("hz", "damping"), TABLES)
+def test_calibrated_table_is_at_rest_at_once(hz, damping):
+    with motion_bench(noise=NoiseModel(structure_hz=hz, structure_damping=damping), seed=3) as (bench, wires):
+        *_, found = Ringing(6).measure(bench)
+        assert isinstance(found, Evaluation)
+        assert found.passed, found.rejections
+        assert found.estimates["frequency"].value == pytest.approx(hz, rel=0.005)
+        assert found.estimates["damping"].value == pytest.approx(damping, rel=0.05)
+        ringing = {key.removeprefix("table."): value for key, value in found.settings.items()}
+        assert max(settling_s(bench, wires.world, **ringing)) < 0.15
+
+
+def test_table_with_little_damping_never_rests_without_calibration():
+    noise = NoiseModel(structure_hz=6.0, structure_damping=0.02)
+    with (
+        motion_bench(noise=noise, seed=3) as (bench, wires),
+        pytest.raises(MotionTimeout, match="did not come to rest"),
+    ):
+        settling_s(bench, wires.world)
+
+
+def test_true_values_lie_within_the_stated_uncertainty():
+    rng = np.random.default_rng(1)
+    z = []
+    for _ in range(12):
+        hz, damping = rng.uniform(6, 20), rng.uniform(0.02, 0.2)
+        estimates = evaluate(drawn(rng, hz, damping)).estimates
+        for name, truth in (("frequency", hz), ("damping", damping)):
+            z.append((estimates[name].value - truth) / estimates[name].uncertainty)
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
+
+
+def test_rigid_disturbed_and_uncertain_tables_are_rejected():
+    rng = np.random.default_rng(2)
+    rigid = [Stop(stop.time_s, rng.normal(0, 0.04, stop.time_s.size)) for stop in drawn(rng, 9.0, 0.1)]
+    assert codes(evaluate(rigid)) == [RejectionCode.NO_RINGING]
+    two = [
+        Stop(one.time_s, one.rate_dps + other.rate_dps)
+        for one, other in zip(drawn(rng, 8.0, 0.05), drawn(rng, 14.0, 0.05), strict=True)
+    ]
+    assert RejectionCode.RINGING_UNCLEAR in codes(evaluate(two))
+    rocking = [drawn(rng, hz, 0.1)[0] for hz in (9.0, 10.0, 11.0, 9.5)]  # each time at another frequency
+    assert RejectionCode.RINGING_UNCERTAIN in codes(evaluate(rocking))
+
+
+def test_too_few_stops_are_a_usage_error():
+    with pytest.raises(UsageError):
+        Ringing(stops=3)
