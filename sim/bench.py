@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, fields
+from dataclasses import fields
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from rig.bench.hardware import assemble
 from rig.config import RigConfig, Section
 from rig.core.clock import SystemClock
 from rig.core.errors import ObjectNotFound, UsageError
+from rig.core.json_form import plain
 from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.calibration_board import HOME_MARK, boards, home_mark
 from sim.camera import CAMERA_DEVICE
@@ -44,7 +45,7 @@ class SimOptions(Section):
     speed: float | None = Field(
         None, gt=0, le=1000, description="simulated seconds per second; default: as fast as the computer can"
     )
-    noise: dict[str, float] = Field(default_factory=dict, description="noise model: values to change")
+    noise: dict[str, Any] = Field(default_factory=dict, description="noise model: values to change")
     faults: list[Any] = Field(
         default_factory=list, description='simulated faults, e.g. ["jam@move3+2s"]; rig faults lists them'
     )
@@ -60,11 +61,12 @@ class SimOptions(Section):
 
     @field_validator("noise")
     @classmethod
-    def _known(cls, values: dict[str, float]) -> dict[str, float]:
+    def _known(cls, values: dict[str, Any]) -> dict[str, Any]:
         known = [f.name for f in fields(NoiseModel)]
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ValueError(f"unknown: {', '.join(unknown)}; there are {', '.join(known)}")
+        values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
         NoiseModel(**values)  # checks the ranges
         return values
 
@@ -245,7 +247,7 @@ def open_sim_bench(
             raise
         bench.connections = wires.pop_all()
     bench.placer = operator
-    bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
+    bench.conditions = plain({"noise": world.noise, "seed": world.seed})  # as a calibration stores them
     return bench
 
 

@@ -82,6 +82,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     `cut_read`, `stuck`, `stuck_error` (ETIMEDOUT as the adapter of a Raspberry Pi, or EIO as an i2c-tiny-usb), `name`
     (the kernel's name of the adapter), `kernel_drivers` (addresses that a kernel driver uses), `errors` (address to the
     number of the error at each transfer), and `wire`, the last acknowledged messages. `bit_ns` is the time of a bit.
+    `held` returns when the computer is ready for a transfer that is due at a time, in ns.
     `stretch_errors` is the share of reads in which the controller does not wait for a stretched clock, as that of a
     Raspberry Pi 4 does above 20 kHz: it takes a bit too early, and all later bits are late by one.
     """
@@ -96,6 +97,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self.stuck = False
         self.stuck_error = ETIMEDOUT
         self.bit_ns = BIT_NS
+        self.held: Callable[[int], int] = int
         self.stretch_errors = 0.0
         self._rng = np.random.default_rng(0)
         self.kernel_drivers: set[int] = set()
@@ -182,6 +184,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         return 0
 
     def _transaction(self, messages: Callable[[], None], *, stops: bool = True) -> None:
+        self._clock.advance_to(self.held(self._clock.now_ns()))
         if self.stuck:
             self._clock.sleep(TIMEOUT_S)
             raise _os_error(self.stuck_error)

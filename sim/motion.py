@@ -5,7 +5,7 @@ their own time, without an integration in steps.
 """
 
 from dataclasses import dataclass
-from math import copysign, sqrt
+from math import copysign, inf, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,45 +122,61 @@ def to_velocity(
     return path
 
 
-def dragged(path: PiecewiseMotion, start_deg: float, half_deg: float, offset_deg: float) -> PiecewiseMotion:
-    """Return the motion of a shaft that friction and a steady load hold behind its commanded ``path``.
+@dataclass(frozen=True, slots=True)
+class Response:
+    """How a position controller without an integral part moves its shaft along a commanded path.
 
-    A position controller without an integral part pushes in proportion to its error. So the shaft stands until the
-    error overcomes the friction, then follows at a constant distance, and keeps it when the path ends.
-
-    Parameters
-    ----------
-    path
-        The commanded motion; each piece is monotone.
-    start_deg
-        The shaft's angle at the beginning.
-    half_deg
-        Error at which the controller overcomes the friction.
-    offset_deg
-        Error at which it balances the steady load.
+    It asks for a speed in proportion to the error, so the shaft is behind a steady motion by ``lag_s`` of it. Friction
+    holds the shaft within ``half_deg`` of the path, and a steady load shifts it by ``offset_deg``. The shaft takes
+    ``inertia_s`` to reach the speed asked for: with more than a quarter of ``lag_s`` it overshoots.
     """
-    rows: list[tuple[float, float, float, float]] = []
-    shaft = start_deg
-    ends_s = [*path.start_s[1:].tolist(), float("inf")]
-    columns = path.start_s, path.position_deg, path.velocity_dps, path.acceleration_dps2
-    for t, x, v, a, end_s in zip(*(column.tolist() for column in columns), ends_s, strict=True):
-        direction = copysign(1.0, v or a) if v or a else 0.0
-        speed, ramp, duration = v * direction, a * direction, end_s - t
-        away = (shaft - offset_deg - x) * direction + half_deg  # how far the path goes before the shaft follows
-        wait = 0.0
-        if direction and away > 0:
-            square = speed * speed + 2 * ramp * away
-            wait = 2 * away / (speed + sqrt(square)) if square > 0 else float("inf")
-        if not direction or wait >= duration:
-            rows.append((t, shaft, 0.0, 0.0))
-            continue
-        if wait > 0:
-            rows.append((t, shaft, 0.0, 0.0))
-        begun = x + v * wait + 0.5 * a * wait * wait
-        rows.append((t + wait, begun + offset_deg - direction * half_deg, v + a * wait, a))
-        if duration < float("inf"):
-            shaft = x + v * duration + 0.5 * a * duration * duration + offset_deg - direction * half_deg
-    return PiecewiseMotion(*(np.ascontiguousarray(c) for c in np.array(rows, dtype=np.float64).T))
+
+    lag_s: float
+    inertia_s: float
+    half_deg: float
+    offset_deg: float
+    fastest_dps: float
+
+    def follow(self, path: PiecewiseMotion, angle_deg: float, speed_dps: float) -> PiecewiseMotion:
+        """Return the motion of a shaft with this angle and speed at the beginning of ``path``."""
+        step_s = max(self.lag_s / 5, 0.004)
+        lag_s = max(self.lag_s, step_s / 2)  # below it the steps would oscillate
+        rows: list[tuple[float, float, float, float]] = []
+        columns = path.start_s, path.position_deg, path.velocity_dps, path.acceleration_dps2
+        pieces = list(zip(*(column.tolist() for column in columns), strict=True))
+        x, v = angle_deg, speed_dps
+        for (t, p, p_dps, p_dps2), end_s in zip(pieces, [*(piece[0] for piece in pieces[1:]), inf], strict=True):
+            begun = t
+            while end_s - t > 1e-9:
+                h = min(step_s, end_s - t)
+                since = t + h - begun
+                error = p + p_dps * since + 0.5 * p_dps2 * since * since + self.offset_deg - x - v * h / 2
+                sign = copysign(1.0, v or error)
+                if not v and abs(error) <= self.half_deg:
+                    w = 0.0
+                else:
+                    w = self._speed(v, error - sign * self.half_deg, lag_s, h)
+                    w = 0.0 if w * sign < 0 and self.half_deg else w
+                close_dps = min(_STEADY_DPS, abs(p_dps) / 10 or _STEADY_DPS)
+                steady = not p_dps2 and max(abs(w - p_dps), abs(v - p_dps)) < close_dps
+                if steady and (p_dps or abs(error) - self.half_deg < _STEADY_DPS * lag_s + abs(v) * h):
+                    h, v, w = end_s - t, p_dps, p_dps
+                rows.append((t, x, v, (w - v) / h))
+                t, x, v = t + h, x + (v + w) / 2 * h if h < inf else x, w
+        return PiecewiseMotion(*(np.ascontiguousarray(c) for c in np.array(rows, dtype=np.float64).T))
+
+    def _speed(self, speed_dps: float, error_deg: float, lag_s: float, step_s: float) -> float:
+        """Return the speed after a step, by the trapezoidal rule; ``error_deg`` lacks the second half of the step."""
+        inertia = self.inertia_s / step_s
+        speed = (inertia * speed_dps + error_deg / lag_s) / (inertia + 1 + step_s / 2 / lag_s)
+        asked = (error_deg - speed * step_s / 2) / lag_s
+        if abs(asked) > self.fastest_dps:
+            speed = (inertia * speed_dps + copysign(self.fastest_dps, asked)) / (inertia + 1)
+        return speed
+
+
+_STEADY_DPS = 0.02
+"""Difference of speed at which a shaft counts as following steadily."""
 
 
 class Ripple:

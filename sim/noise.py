@@ -1,7 +1,10 @@
 """All errors of the simulated bench."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Any, Self
+
+Axes = float | tuple[float, float, float]
+"""One number for all axes of a sensor, or one for each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,6 +18,14 @@ class NoiseModel:
     # Servo and table: XL430-W250 e-manual, measured backlash of its gears.
     backlash_deg: float = 0.25
     """Backlash between shaft and platter, full width."""
+    servo_lag: float = 0.0
+    """Lag of the shaft behind its motion profile, as a share of what the gains of its position controller give: 1 is a
+    real servo."""
+    servo_friction: float = 0.0
+    """Friction at rest, as a share of the stall torque. 0.0254 is a real XL430: asked for 1000 counts it stops at 995,
+    asked for 1450 at 1446 (answers.ros.org 303081), and 885 / 5 counts push with the stall torque."""
+    servo_friction_spread: float = 0.2
+    """Standard deviation, from part to part, of the logarithm of that friction."""
     encoder_noise_deg: float = 0.02
     """Standard deviation of one encoder reading before its quantisation to 0.088°."""
     encoder_harmonic_deg: float = 0.0
@@ -30,12 +41,15 @@ class NoiseModel:
     voltage_noise_v: float = 0.05
     """Standard deviation of the supply voltage."""
 
-    # Gyro and accelerometer: MPU-6000/6050 product specification rev 3.4, sections 6.1 and 6.2.
-    gyro_noise_dps_rthz: float = 0.005
-    """Rate noise density."""
+    # Gyro and accelerometer: MPU-6000/6050 product specification rev 3.4, sections 6.1 and 6.2; gyro's noise: a real
+    # one at rest (docs/explanation/simulator-against-recordings.md).
+    gyro_noise_dps_rthz: Axes = (0.0075, 0.0055, 0.0056)
+    """Rate noise density (specified: 0.005)."""
+    gyro_flicker_dps: Axes = (0.004, 0.0009, 0.0007)
+    """Flicker floor: the Allan deviation of the rate's 1/f noise, the same over all times from 1 to 1000 s."""
     gyro_bias_dps: float = 5.0
     """Standard deviation of the zero-rate output from part to part (specified within ±20 °/s)."""
-    gyro_bias_walk_dps_rts: float = 0.0003
+    gyro_bias_walk_dps_rts: float = 0.0001
     """Random walk of the bias, per square root of a second."""
     gyro_bias_slope_dps_c: float = 0.02
     """Standard deviation of the zero rate's slope over temperature (specified: ±20 °/s between −40 and 85 °C)."""
@@ -95,7 +109,8 @@ class NoiseModel:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not 0 <= value < float("inf"):
+            axes = value if isinstance(value, tuple) and isinstance(field.default, tuple) else (value,)
+            if not all(isinstance(one, (int, float)) and 0 <= one < float("inf") for one in axes):
                 raise ValueError(f"{field.name} = {value!r}: give a finite number that is not negative")
         if self.structure_damping >= 1:
             raise ValueError(
@@ -114,6 +129,6 @@ class NoiseModel:
         zeros = dict.fromkeys((f.name for f in fields(cls)), 0.0)
         return cls(**zeros)
 
-    def with_values(self, **values: float) -> Self:
+    def with_values(self, **values: Any) -> Self:
         """Return a copy with some values changed."""
         return replace(self, **values)

@@ -89,6 +89,26 @@ def _intermittent(devices: SimDevices, values: Values, _rng: np.random.Generator
     return repeatedly(devices.world.clock, values["period"], devices.imu.power_cycle)
 
 
+@simulated_fault(
+    "imu.bursts",
+    "The computer is busy, so the gyro's samples reach it in bursts.",
+    longest=Parameter(0.5, "longest pause, s: one of 1000", 0.065, 10),
+)
+def _bursts(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+    """Let the computer pause as it did in a recording (docs/explanation/simulator-against-recordings.md)."""
+    awake = [0, 0]  # it is busy before, and again from then on
+
+    def held(time_ns: int) -> int:
+        while time_ns >= awake[1]:
+            pause_s = values["longest"] if rng.random() < 0.001 else rng.uniform(0.005, 0.065)
+            begins = (awake[1] or time_ns) + round(pause_s * 1e9)
+            awake[:] = begins, begins + 5_000_000
+        return max(time_ns, awake[0])
+
+    devices.i2c.held = held
+    return lambda: setattr(devices.i2c, "held", int)
+
+
 @simulated_fault("i2c_nack", "The cable is long. Some transfers are not acknowledged.", rate=share(0.02, "transfers"))
 def _nack(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
     def nacks(_address: int) -> bool:

@@ -254,7 +254,7 @@ def _slip(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End
 )
 def _friction(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
     devices.servo.motor.set_friction(values["friction"], values["load"])
-    return lambda: devices.servo.motor.set_friction(0.0)
+    return lambda: devices.servo.motor.set_friction()
 
 
 @simulated_fault("jam", "The shaft is blocked.")

@@ -78,9 +78,9 @@ class _WorldAtBoardTime:
 class SimHead:
     """A simulated rig head.
 
-    Drivers use `sim.head.serial_port.HeadSerial`. Tests use `estop_open`, `stuck`, `nack`, `nack_conditions`, `attach`
-    and `detach` (as of `sim.i2c.SimI2cBus`), `reset`, `hang`, `unplugged` (the board runs without its cable), the
-    outputs and their history, and the filters.
+    Drivers use `sim.head.serial_port.HeadSerial`. Tests use `estop_open`, `stuck`, `nack`, `nack_conditions`, `attach`,
+    `detach` and `held` (as of `sim.i2c.SimI2cBus`; here it is for bytes to the host), `reset`, `hang`, `unplugged` (the
+    board runs without its cable), the outputs and their history, and the filters.
 
     Parameters
     ----------
@@ -125,6 +125,7 @@ class SimHead:
         self.resets: list[Reset] = []
         self.nack_conditions: list[Callable[[int], bool]] = []
         self.unplugged = False
+        self.held: Callable[[int], int] = int
         self._devices: dict[int, I2cDevice] = {}
         self._addressed: I2cDevice | None = None
         self._nacks = 0
@@ -316,7 +317,7 @@ class SimHead:
                 if event == _BYTE:
                     arriving = self._filtered(False, value) if self.filters else value
                     if arriving is not None:
-                        self._coming.append((time_ns, arriving))
+                        self._coming.append((self.held(time_ns), arriving))
                 else:
                     self._output(time_ns, event, value)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import cache
-from math import cos, pi, radians, sin, sqrt, tan
+from math import cos, inf, pi, radians, sin, sqrt, tan
 from typing import Protocol
 
 import numpy as np
@@ -13,9 +13,12 @@ from sim.motion import Floats
 from sim.world import World
 
 WARM_UP_S = 300.0  # time constant of the warming of a sensor on a small board in still air
+FLICKER_NS = 100_000_000  # step of the flicker noise
 Words = np.ndarray[tuple[int, int], np.dtype[np.int16]]
 
 _BLOCK = 64  # samples that are filtered together
+# With time constants a factor 4 apart, the standard deviation of each part is the Allan deviation of the sum.
+_FLICKER_STEPS = 1e9 / FLICKER_NS * 4.0 ** np.arange(6)[:, None]
 
 
 class InertialModel:
@@ -23,14 +26,15 @@ class InertialModel:
 
     The rate is that of the table about the vertical, which is tilted in the sensor's axes by the mounting. It is
     averaged over each internal sample, so that even a short knock is measured. It has a scale error for each axis, a
-    bias with a random walk and a dependence on the sensor's temperature, and white noise of the given one-sided
-    density. The force is gravity with a bias and white noise. Both pass a second-order Butterworth low-pass. The
-    centripetal and tangential acceleration of a sensor off the axis is left out (1 cm at 90 °/s: 2.5 mg).
+    bias with a random walk, flicker noise and a dependence on the sensor's temperature, and white noise of the given
+    one-sided density. The force is gravity with a bias and white noise. Both pass a second-order Butterworth low-pass.
+    The centripetal and tangential acceleration of a sensor off the axis is left out (1 cm at 90 °/s: 2.5 mg).
 
     Parameters
     ----------
     world
-        Provides the motion, the noise model, and the streams ``name-part`` (drawn once) and ``name-noise``.
+        Provides the motion, the noise model, and the streams ``name-part`` (drawn once), ``name-noise`` and
+        ``name-flicker``.
     name
         Name of the sensor.
     gyro_noisier
@@ -56,7 +60,11 @@ class InertialModel:
         self.up: Floats = np.array([-sin(pitch), sin(roll) * cos(pitch), cos(roll) * cos(pitch)])
         self.gyro_slope_dps_c: Floats = noise.gyro_bias_slope_dps_c * part.standard_normal(3)
         self._powered_ns = world.clock.now_ns()
-        self._density: Floats = np.repeat([gyro_noisier * noise.gyro_noise_dps_rthz, noise.accel_noise_g_rthz], 3)
+        self._flicker_rng = world.rng(f"{name}-flicker")
+        self._flicker_dps: Floats = gyro_noisier * np.broadcast_to(noise.gyro_flicker_dps, 3)
+        self._flicker, self._flicker_step = np.zeros((len(_FLICKER_STEPS), 3)), -inf
+        density = gyro_noisier * np.broadcast_to(noise.gyro_noise_dps_rthz, 3)
+        self._density: Floats = np.concatenate([density, np.repeat(noise.accel_noise_g_rthz, 3)])
         self.restart()
 
     def restart(self) -> None:
@@ -90,6 +98,8 @@ class InertialModel:
         felt = np.empty((n, 6))
         felt[:, :3] = rate_dps[:, None] * (self.gyro_gain * self.up) + bias
         felt[:, :3] += self.warmth_c(times_ns)[:, None] * self.gyro_slope_dps_c
+        if self._flicker_dps.any():
+            felt[:, :3] += self._flicker_at(times_ns)
         felt[:, 3:] = self.up + self.accel_bias_g
         before, filtered_before = self._filter_state or (felt[[0, 0]],) * 2
         felt += self._density * sqrt(rate_hz / 2) * draws[:, :6]
@@ -101,6 +111,19 @@ class InertialModel:
         self.gyro_bias_dps = bias[-1]
         self._last_ns, self._last_deg = int(times_ns[-1]), float(angle_deg[-1])
         return filtered[:, :3], filtered[:, 3:]
+
+    def _flicker_at(self, times_ns: NDArray[np.int64]) -> Floats:
+        """Return the flicker noise of the rate, (n, 3): a sum of first-order processes, constant within each step."""
+        steps = times_ns // FLICKER_NS
+        values: list[Floats] = []
+        for step in range(int(steps[0]), int(steps[-1]) + 1):
+            if step > self._flicker_step:
+                kept = np.exp((self._flicker_step - step) / _FLICKER_STEPS)
+                drawn = self._flicker_rng.standard_normal(self._flicker.shape)
+                self._flicker, self._flicker_step = kept * self._flicker + np.sqrt(1 - kept**2) * drawn, step
+            values.append(self._flicker.sum(axis=0))
+        flicker: Floats = self._flicker_dps * np.array(values)[steps - steps[0]]
+        return flicker
 
 
 @cache

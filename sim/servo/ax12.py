@@ -44,6 +44,8 @@ AX_12A = ServoModel(
     ranges=MappingProxyType({"ID": range(254)}),
     supply_v=12.0,
     no_load_dps=59.0 * 6.0,
+    stall_error_deg=32 * DEG_PER_COUNT,  # its Compliance Slope
+    inertia_s=0.055,  # fitted to a recorded step (docs/explanation/simulator-against-recordings.md)
 )
 
 

@@ -87,6 +87,12 @@ class ServoModel:
     acceleration_dps2
         Acceleration at stall torque with a light platter, in °/s²: the maximum. It is an estimate (no-load speed within
         about 0.1 s): the e-manual gives the torque, but the inertia depends on the platter.
+    stall_error_deg
+        Error at which the position controller pushes with the stall torque; X series: PWM Limit over Position P Gain /
+        128 (e-manual, Position PID Gain), in counts.
+    inertia_s
+        Time constant of the speed. With more than a quarter of the lag, which is the ``stall_error_deg`` over the
+        maximum speed, the shaft overshoots; 0: the D gain damps it.
     stall_current
         Present Current at stall, in the register's unit; None for models that report Present Load instead.
     """
@@ -98,6 +104,8 @@ class ServoModel:
     supply_v: float
     no_load_dps: float
     acceleration_dps2: float = 3000.0
+    stall_error_deg: float = 885 / (640 / 128) * 360 / 4096
+    inertia_s: float = 0.0
     stall_current: int | None = field(default=None)
 
 
@@ -115,6 +123,7 @@ def _model(
     initial: Mapping[str, int] = MappingProxyType({}),
     ranges: Mapping[str, Container[int]] = MappingProxyType({}),
     stall_current: int | None = None,
+    counts: int = 4096,
 ) -> ServoModel:
     """Return a model with its initial limits, velocity gains (I, P) and Position P Gain; ``ranges`` of other registers.
 
@@ -135,6 +144,7 @@ def _model(
         MappingProxyType(_RANGES | limits | dict(ranges)),
         supply_v,
         no_load_rpm * 6.0,
+        stall_error_deg=first["PWM Limit"] / (gains[2] / 128) * 360 / counts,
         stall_current=stall_current,
     )
 
@@ -196,6 +206,7 @@ _MODELS = (
         "ph54_200_s500",
         13,  # the e-manual names no firmware
         supply_v=24.0,
+        counts=1_003_846,
         no_load_rpm=33.1,
         temperature=80,
         voltage=(150, 350),

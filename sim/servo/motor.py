@@ -1,17 +1,13 @@
 """The gear motor on the world's shaft: trajectory, load, temperature and jams."""
 
 from dataclasses import dataclass
-from math import exp
+from math import copysign, exp
 
-from sim.motion import PiecewiseMotion, dragged, rest, to_position, to_velocity
+from sim.motion import PiecewiseMotion, Response, rest, to_position, to_velocity
 from sim.servo.models import ServoModel
 from sim.servo.shaft import Shaft
 
 FRICTION_LOAD = 0.04  # friction of the gears while the shaft rotates, as a part of the stall torque
-PWM_PER_COUNT = 5.0
-"""PWM of the position controller for each count of error: Position P Gain 640 / 128 (e-manual, XL430-W250)."""
-_ERROR_AT_STALL_DEG = 885 / PWM_PER_COUNT * 360 / 4096
-"""Error at which the position controller pushes with the stall torque."""
 SUPPLY_DROP_V = 0.4  # voltage lost in the supply's cable at stall
 
 AMBIENT_C = 25.0  # a laboratory
@@ -44,8 +40,8 @@ class MotorState:
 class Motor:
     """A position- or speed-controlled shaft in the world's degrees.
 
-    The shaft follows the commanded trajectory exactly, unless `set_friction` holds it back or it is jammed: then it
-    does not move, and the controller's error and the load grow. `settle` updates heat and overload with the present
+    The shaft follows the commanded trajectory by its `Response`, without noise exactly. If it is jammed it does not
+    move, and the controller's error and the load grow. `settle` updates heat and overload with the present
     load; the owner of the motor calls it repeatedly while the motor is `busy`.
     """
 
@@ -56,7 +52,12 @@ class Motor:
         self._model = model
         self.driven = False
         self._jammed = False
-        self._friction = self._steady_load = 0.0
+        noise = world.noise
+        self._lag_s = noise.servo_lag * model.stall_error_deg / model.no_load_dps
+        spread = noise.servo_friction_spread * float(world.rng("servo-friction").standard_normal())
+        self._own_friction = self._friction = noise.servo_friction * exp(spread)
+        self._steady_load = 0.0
+        self._still_s = 0.0
         self._temperature_c = AMBIENT_C + STANDBY_RISE_C
         self._overloaded_s = 0.0
         self._settled_s = self._now_s()
@@ -70,7 +71,8 @@ class Motor:
 
     @property
     def steepest_dps2(self) -> float:
-        return self._model.acceleration_dps2
+        inert = self._lag_s and self._model.inertia_s  # then its response limits the acceleration, not its profile
+        return self._model.acceleration_dps2 * (10 if inert else 1)
 
     @property
     def profile_ongoing(self) -> bool:
@@ -80,7 +82,8 @@ class Motor:
     @property
     def busy(self) -> bool:
         """Whether the load varies: the shaft rotates, or is blocked while driven."""
-        return self.driven and (self._jammed or self.profile_ongoing or bool(self.commanded.velocity_dps[-1]))
+        moves = max(self.commanded.end_s, self._still_s) > self._now_s() or bool(self.commanded.velocity_dps[-1])
+        return self.driven and (self._jammed or moves)
 
     @property
     def overloaded(self) -> bool:
@@ -92,13 +95,11 @@ class Motor:
         target, target_dps, acceleration = self.commanded.state_at(now_s)
         load = pwm = 0.0
         if self.driven:
-            pushing = (target - angle) / _ERROR_AT_STALL_DEG
-            if self._jammed:
-                load = _clamp(pushing)
+            if speed:
+                friction = copysign(max(FRICTION_LOAD, self._friction), speed)
+                load = _clamp(friction + (1 - FRICTION_LOAD) * acceleration / self.steepest_dps2)
             else:
-                friction = FRICTION_LOAD * ((speed > 0) - (speed < 0))
-                inertia = (1 - FRICTION_LOAD) * acceleration / self.steepest_dps2
-                load = _clamp(friction + inertia + (pushing if self._friction else 0.0))
+                load = _clamp((target - angle) / self._model.stall_error_deg)
             pwm = _clamp(speed / self.fastest_dps + load)
         return MotorState(angle, speed, target, target_dps, load, pwm)
 
@@ -133,7 +134,11 @@ class Motor:
 
     def brake(self) -> None:
         """Stop as fast as possible and hold."""
-        self._follow(self._stop())
+        state = self.state()
+        if self._jammed:
+            self._follow(self._stop())
+        else:
+            self._follow(to_velocity(self._now_s(), state.target_deg, state.target_dps, 0.0, self.steepest_dps2))
 
     def go_to(self, angle_deg: float, v_max: float, a_max: float) -> None:
         state = self.state()
@@ -164,15 +169,16 @@ class Motor:
             goal = float(self.commanded.position_deg[-1])
             self._follow(to_position(self._now_s(), angle, 0.0, goal, self.fastest_dps, self.steepest_dps2))
 
-    def set_friction(self, friction: float, steady_load: float = 0.0) -> None:
+    def set_friction(self, friction: float | None = None, steady_load: float = 0.0) -> None:
         """Set the friction at rest, and a steady load that pushes clockwise, as shares of the stall torque.
 
-        It acts from the next motion on. A load above the friction would rotate a released shaft, so it counts only up
-        to the friction. Without friction, the shaft moves to its commanded angle.
+        Without a number the friction is that of the part. A load above the friction would rotate a released shaft, so
+        it counts only up to the friction. A driven shaft moves as close to its commanded angle as the friction permits.
         """
         self.settle()
-        self._friction, self._steady_load = friction, min(max(steady_load, -friction), friction)
-        if not friction and self.driven and not self._jammed and not self.commanded.velocity_dps[-1]:
+        self._friction = self._own_friction if friction is None else friction
+        self._steady_load = min(max(steady_load, -self._friction), self._friction)
+        if self.driven and not self._jammed and not self.commanded.velocity_dps[-1] and not self.profile_ongoing:
             goal = float(self.commanded.position_deg[-1])
             self._follow(
                 to_position(self._now_s(), *self._world.shaft(), goal, self.fastest_dps, self.steepest_dps2),
@@ -197,11 +203,14 @@ class Motor:
         self.commanded = path
         if driven is not None:
             self.driven = driven
-        if self._friction and self.driven:
-            error_deg = _ERROR_AT_STALL_DEG * self._friction, -_ERROR_AT_STALL_DEG * self._steady_load
-            path = dragged(path, self._world.shaft()[0], *error_deg)
-        if not self._jammed:
-            self._world.drive(path)
+        if self._jammed:
+            return
+        if self.driven and (self._lag_s or self._friction):
+            half_deg, offset_deg = (self._model.stall_error_deg * part for part in (self._friction, -self._steady_load))
+            response = Response(self._lag_s, self._model.inertia_s, half_deg, offset_deg, self.fastest_dps)
+            path = response.follow(path, *self._world.shaft())
+        self._still_s = path.end_s
+        self._world.drive(path)
 
     def _now_s(self) -> float:
         return self._world.clock.now_ns() * 1e-9

@@ -44,7 +44,7 @@ SEVERAL_AT_ONCE = (
     ("servo.slow", "crc_flip", "late_reply", "friction", "camera.slow", "stamp_jump", "light_flicker"),
     ("servo.intermittent", "duplicate_reply", "i2c_nack", "lost_frames", "stamps_backwards", "mains_flicker"),
     ("babble", "camera.delayed", "camera.intermittent", "stamp_jitter", "clock_jump"),
-    ("echo", "doubled_frame"),
+    ("echo", "doubled_frame", "imu.bursts"),
 )
 """Faults that stop no enrollment, in groups that can happen together."""
 

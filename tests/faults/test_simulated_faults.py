@@ -50,7 +50,7 @@ VOCABULARY = {
         "i2c_stuck",
         "i2c_hang",
     ),
-    *("imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker"),
+    *("imu.bursts", "imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker"),
     *("mains_flicker", "disk_full", "clock_jump"),
     *("lost_frames", "doubled_frame", "stamp_jump", "stamps_backwards", "stamp_jitter"),
 }
@@ -220,7 +220,7 @@ def _hooks(devices):
         *(len(hooks) for hooks in (devices.servo_bus.filters, devices.servo.distortions, devices.imu.distortions)),
         *(len(hooks) for hooks in (devices.i2c.nack_conditions, devices.camera.filters, devices.camera.grab_failures)),
         len(devices.servo_bus._devices),
-        *(devices.servo_bus.echo, devices.servo_bus.deaf, devices.i2c.stuck, devices.camera.hangs),
+        *(devices.servo_bus.echo, devices.servo_bus.deaf, devices.i2c.stuck, devices.i2c.held, devices.camera.hangs),
         *(devices.camera.every, devices.camera.latency_ns, devices.camera.blur_px, devices.world.noise),
         *(
             devices.servo.powered,
@@ -284,6 +284,18 @@ def test_clock_jump_changes_civil_time_but_not_the_monotonic_clock(devices):
     Faults(devices).schedule(Fault.parse("clock_jump:seconds=60"))
     assert (devices.world.clock.utc() - before).total_seconds() == 60
     assert devices.world.clock.now_ns() == before_ns
+
+
+def test_bursts_have_the_recorded_intervals_between_host_times(devices):
+    """Samples of 100 Hz over ten minutes, each of which takes 2 ms to arrive, as in the recording of a real gyro."""
+    Faults(devices).schedule(Fault.parse("imu.bursts"))
+    arrived = [0.0]
+    for due_ns in range(10_000_000, 600_000_000_000, 10_000_000):
+        arrived.append(max(devices.i2c.held(due_ns) * 1e-6, arrived[-1] + 2))
+    median, most, longest = np.quantile(np.diff(arrived), [0.5, 0.95, 1.0])
+    assert median == pytest.approx(2, abs=0.2)
+    assert most == pytest.approx(48, rel=0.2)
+    assert longest == pytest.approx(500, rel=0.2)
 
 
 def test_fault_at_the_start_stops_the_bench_from_opening():

@@ -1,14 +1,17 @@
 """The simulated MPU-6050, register by register, through the real smbus2."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
+from calibration.gyro_noise import allan
 from hypothesis import given
 from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
 from sim.i2c import SimI2cBus
+from sim.imu.inertial import InertialModel
 from sim.imu.mpu6050 import BANDWIDTH_HZ, SimMpu6050
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
@@ -321,6 +324,22 @@ def test_bias_walks_at_the_models_pace() -> None:
             sensor.read(1)
         drifts.append(sensor.inertial.gyro_bias_dps)
     assert np.std(drifts) == pytest.approx(pace * 2, rel=0.15)
+
+
+def test_flicker_noise_has_one_allan_deviation_at_all_times_however_it_is_read() -> None:
+    floor = (0.004, 0.0, 0.001)
+    times_ns = np.arange(1, 200_001, dtype=np.int64) * 100_000_000
+
+    def rates(parts: int) -> Any:
+        part = InertialModel(World(noise=NoiseModel.none().with_values(gyro_flicker_dps=floor)), "imu")
+        return np.concatenate([part.sample(some, 10.0, 4.9)[0] for some in np.array_split(times_ns, parts)])
+
+    read = rates(1)
+    assert rates(997) == pytest.approx(read, abs=1e-12)
+    for axis, expected in enumerate(floor):
+        tau_s, deviation, _ = allan(read[:, axis], 0.1)
+        between = (tau_s > 2) & (tau_s < 300)
+        assert deviation[between] == pytest.approx(expected, rel=0.2, abs=1e-12)
 
 
 def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:

@@ -1,5 +1,7 @@
 """The noise model: invalid values are rejected, also by the simulated bench."""
 
+from typing import Any
+
 import pytest
 
 from rig.bench import open_bench
@@ -16,9 +18,11 @@ from sim.noise import NoiseModel
         ("gyro_bias_dps", float("inf")),
         ("structure_damping", 1.0),
         ("vignetting", 1.1),
+        ("gyro_flicker_dps", (0.1, -0.1, 0.1)),
+        ("vignetting", (0.1, 0.1, 0.1)),
     ],
 )
-def test_invalid_noise_values_are_rejected_by_name(name: str, value: float) -> None:
+def test_invalid_noise_values_are_rejected_by_name(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"{name} = "):
         NoiseModel(**{name: value})
 

@@ -17,7 +17,7 @@ from sim.servo.base import (
     VOLTAGE_ERROR,
 )
 from sim.servo.models import MODELS
-from sim.servo.motor import OVERLOAD_S, PWM_PER_COUNT
+from sim.servo.motor import OVERLOAD_S
 from sim.servo.protocol2 import StatusError
 from tests.fuzzing import examples
 from tests.sim.servo.servo_bench import ALERT, DEG_PER_COUNT, Line, extended
@@ -179,8 +179,8 @@ def test_jam_shows_as_following_error_then_load_then_overload(line: Line) -> Non
     while not servo.memory["Hardware Error Status"] and line.clock.now_ns() < jammed_ns + 10_000_000_000:
         line.sleep(0.01)
     elapsed_s = (line.clock.now_ns() - jammed_ns) * 1e-9
-    # The load saturates when the error has grown to 885 / PWM_PER_COUNT counts at 44 units of speed.
-    saturation_s = 885 / PWM_PER_COUNT * DEG_PER_COUNT / (44 * 1.374)
+    # The load saturates when the error has grown so far at 44 units of speed.
+    saturation_s = MODELS["xl430_w250"].stall_error_deg / (44 * 1.374)
     assert elapsed_s == pytest.approx(saturation_s + OVERLOAD_S, abs=2 * SUPERVISION_S)
     assert line.read("Hardware Error Status") == OVERLOAD_ERROR
     assert line.read("Torque Enable") == 0
