@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from calibration.gyro_noise import allan
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
@@ -28,6 +27,7 @@ from sim.noise import NoiseModel
 from sim.servo import Ax12Servo, XSeriesServo
 from sim.servo.ax12 import DEG_PER_COUNT
 from sim.world import World
+from tests.allan import allan
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "explanation" / "simulator-against-recordings.md"

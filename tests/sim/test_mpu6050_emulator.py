@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration.gyro_noise import allan
 from hypothesis import given
 from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
@@ -16,6 +15,7 @@ from sim.imu.mpu6050 import BANDWIDTH_HZ, SimMpu6050
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.world import World
+from tests.allan import allan
 from tests.fuzzing import examples
 
 AT = 0x68
