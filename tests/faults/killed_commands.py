@@ -26,7 +26,7 @@ COMMANDS = {
     "verify": ("catalog", "verify"),
     "configuration": ("config", "set", "identify.max_views", "5"),
     "tray": ("enroll", "--list", "tray.csv", "--yes"),
-    "search": ("identify", "--save-run", "run", "--set", "bench.sim.object=dice"),
+    "search": ("identify", "--save-run", "run", "--set", "bench.sim.object=radio"),
 }
 
 

@@ -267,7 +267,7 @@ def test_move_interrupted_by_another_leaves_no_jump(
 
 
 @quick
-@given(trajectories(), st.floats(0.001, 0.1), st.floats(0, 3), st.floats(-1, 1), st.floats(-1, 1))
+@given(trajectories(), st.floats(0.02, 0.1), st.floats(0, 3), st.floats(-1, 1), st.floats(-1, 1))
 def test_shaft_rests_within_the_error_that_friction_holds(
     path: PiecewiseMotion, lag_s: float, half: float, load: float, start: float
 ) -> None:

@@ -98,7 +98,8 @@ def test_image_of_another_size_is_rejected_and_the_search_continues(simulated, s
     assert all(issue in e.segmentation["issues"] for e in events if isinstance(e, Accepted))
 
 
-def test_image_of_another_bench_is_reported_once_and_not_used(simulated, shelf):
+def test_image_of_another_bench_is_reported_once_and_not_used(simulated, shelf, monkeypatch):
+    monkeypatch.setattr("hbr.dense.stopping.HOPELESS", 1.0)  # the search takes all its views
     s = simulated("identify.max_views=5")
     other = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
     events, answer = search(s, with_table(shelf, other), "radio")

@@ -99,7 +99,7 @@ def test_last_steps_use_the_views_of_the_new_object_alone(model: Model, tmp_path
 
 def test_less_evidence_is_needed_if_the_gyro_saw_the_platter_move(model: Model) -> None:
     needed = {}
-    for faults in ((REPLACED,), (REPLACED, "slip:angle=4@move1")):
+    for faults in ((REPLACED,), (REPLACED, "slip:angle=8@move1")):
         with opened(*faults) as bench:
             events = list(identify(bench, model, strategy="dense"))
         assert any(not event.agrees for event in of_kind(Moved, events)) is (len(faults) > 1)
