@@ -31,7 +31,7 @@ from hbr.dense.evidence import COMMON, numbers
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.pixel_fit import LocalView, PixelFit
-from hbr.dense.session import Fits, near, verify
+from hbr.dense.session import Fits, answered, near, verify
 from hbr.dense.space import MOST_PAIRED, PRIOR, Statistics, of_others, parts_of, unit_vectors, uses_of, whitening
 from hbr.dense.stopping import WEIGHTS
 from hbr.descriptors import descriptor
@@ -155,7 +155,7 @@ class _Searches:
                         for levels, deg in zip(seen.levels, azimuths_deg, strict=True):
                             so_far = update_belief(_levels(levels, kind), deg, so_far)
                         assert isinstance(so_far, Belief)
-                        fit = verify(so_far, queries, self._near, fits)
+                        fit = answered(verify(so_far, queries, fits), self._near)
                         assert fit is not None
                         found[kind].append(_row(so_far, fit, item.name, other_bench=search.other_bench))
         return found

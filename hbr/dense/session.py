@@ -1,8 +1,9 @@
 """One search by the dense filter: views in; belief, decision and next best view out. It reads no image itself.
 
 `DenseSession.verify`, after each view at rest, compares the views with enrolled ones, pixel by pixel
-(`hbr.dense.pixel_fit`). The driver of the search brings the enrolled views at the estimated pose. The share of the
-views' contrast that they explain is a part of the posterior (`hbr.dense.stopping`).
+(`hbr.dense.pixel_fit`). It asks for the enrolled views at the estimated pose (`NeedEnrolledViews`); the driver of the
+search brings them. The share of the views' contrast that they explain is a part of the posterior
+(`hbr.dense.stopping`).
 
 If the object was replaced or rotated by hand, the search begins again with the views since then (`hbr.dense.change`).
 
@@ -10,8 +11,8 @@ Decisions: docs/decisions/0013, docs/decisions/0015, docs/decisions/0017.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import ClassVar, Final
+from collections.abc import Callable, Generator, Sequence
+from typing import ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,10 +37,36 @@ _COMPARED: Final = 3  # the two leaders, and one more if these are near twins
 #: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search.
 _NOT_WORTH_A_FIT: Final = 0.95
 
-EnrolledViews = Callable[[int, Sequence[float]], Sequence[LocalView] | None]
-"""Returns the enrolled views of an object, by its index in the views' names, near some azimuths; None: it cannot."""
+_Result = TypeVar("_Result")
+
+
+class NeedEnrolledViews(NamedTuple):
+    """A search needs the enrolled views of an object, by its index in the views' names, near some azimuths.
+
+    The answer is None if they cannot be read: the search then ends without them.
+    """
+
+    object_index: int
+    azimuths_deg: tuple[float, ...]
+
+
+Asking = Generator[NeedEnrolledViews, Sequence[LocalView] | None, _Result]
+"""A step of a search that asks for enrolled views, and returns its result."""
 Queries = Callable[[int], Sequence[LocalView]]
 """Returns a view of a search by each of its segmentations, the likeliest first."""
+
+
+def answered(
+    step: Asking[_Result], enrolled: Callable[[int, Sequence[float]], Sequence[LocalView] | None] = lambda *_: None
+) -> _Result:
+    """Return the result of a step; ``enrolled`` returns the enrolled views of an object near some azimuths."""
+    try:
+        need = next(step)
+        while True:
+            need = step.send(enrolled(*need))
+    except StopIteration as end:
+        result: _Result = end.value
+        return result
 
 
 def near(own_deg: ArrayLike, azimuths_deg: Sequence[float]) -> IndexArray:
@@ -66,13 +93,13 @@ class Fits:
         self._of_pairs: dict[tuple[int, float, float], float] = {}
 
     def views(
-        self, object_index: int, own_deg: FloatArray, azimuths_deg: Sequence[float], enrolled: EnrolledViews
-    ) -> Sequence[LocalView] | None:
+        self, object_index: int, own_deg: FloatArray, azimuths_deg: Sequence[float]
+    ) -> Asking[Sequence[LocalView] | None]:
         """Return enrolled views of an object, those next to some azimuths among them; ``own_deg`` has those of all."""
         known = self._views.setdefault(object_index, {})
         unknown = [deg for deg in azimuths_deg if not known.keys() >= set(own_deg[_nearest(own_deg, deg)].tolist())]
         if unknown:
-            found = enrolled(object_index, unknown)
+            found = yield NeedEnrolledViews(object_index, tuple(unknown))
             if not found:
                 return None
             known.update((view.azimuth_deg, view) for view in found)
@@ -102,7 +129,7 @@ class Fits:
         return self._enrolled[key]
 
 
-def verify(belief: Belief, queries: Queries, enrolled: EnrolledViews, fits: Fits | None = None) -> PixelFit | None:
+def verify(belief: Belief, queries: Queries, fits: Fits | None = None) -> Asking[PixelFit | None]:
     """Compare the views of a search with the enrolled views of its leading candidates; None without such views.
 
     The queries are in the order of the belief's.
@@ -116,7 +143,7 @@ def verify(belief: Belief, queries: Queries, enrolled: EnrolledViews, fits: Fits
         pose_deg = azimuth_of(belief, candidate)
         azimuths_deg = [wrap360(pose_deg + o - last_deg) for o in belief.orientation_deg.tolist()]
         own_deg = belief.index.views.azimuth_deg[belief.index.views.of(candidate)]
-        views = fits.views(candidate, own_deg, azimuths_deg, enrolled)
+        views = yield from fits.views(candidate, own_deg, azimuths_deg)
         if views is None:
             return None
         enrolled_deg = np.array([view.azimuth_deg for view in views])
@@ -330,12 +357,13 @@ class DenseSession:
         """Return the decision with which the search ends here, even if it would continue."""
         return self.decision if self.decision.outcome is not Outcome.CONTINUE else self._decide(last=True)
 
-    def verify(self, queries: Queries, enrolled: EnrolledViews) -> PixelFit | None:
-        """Compare the leader with the views pixel by pixel, and decide again; None if that is not worth its time."""
-        return self.use(verify(self.belief, queries, enrolled, self._fits) if self._is_worth_a_fit() else None)
+    def verify(self, queries: Queries, measured: PixelFit | None = None) -> Asking[PixelFit | None]:
+        """Compare the leader with the views pixel by pixel, and decide again; None if that is not worth its time.
 
-    def use(self, measured: PixelFit | None) -> PixelFit | None:
-        """Decide again by a measured fit, and return it."""
+        A fit that was ``measured`` before is used instead of enrolled views.
+        """
+        if measured is None and self._is_worth_a_fit():
+            measured = yield from verify(self.belief, queries, self._fits)
         self.verification = measured
         if measured is not None:
             self.decision = self.present = self._decide()

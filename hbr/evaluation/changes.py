@@ -19,7 +19,7 @@ from hbr.core.arrays import ImageArray, LevelArray
 from hbr.dense.index import DenseIndex
 from hbr.dense.pixel_fit import LocalView
 from hbr.dense.pose import pose
-from hbr.dense.session import DenseSession, near
+from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome
 from hbr.descriptors.together import ViewsTogether
 from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
@@ -242,7 +242,7 @@ class _Search:
         def queries(n: int) -> list[LocalView]:
             return [LocalView(one.crop, one.mask, orientations_deg[n]) for one in views.segmentations[n]]
 
-        session.verify(queries, self._near)
+        answered(session.verify(queries), self._near)
         if session.decision.outcome is not Outcome.CONTINUE:
             end = session.decision
             self._result = SearchResult(

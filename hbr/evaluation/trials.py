@@ -19,7 +19,7 @@ from hbr.dense.index import DenseIndex
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
 from hbr.dense.pixel_fit import LocalView
 from hbr.dense.pose import azimuth_of, pose
-from hbr.dense.session import DenseSession, near
+from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition, EvaluationImage, enrolled_levels, query_levels
@@ -352,7 +352,7 @@ class _Trials:
             own = keep if leader == self._object else self._enrolled[self._views.of(leader)]
             return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
 
-        session.verify(queries, enrolled)
+        answered(session.verify(queries), enrolled)
 
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
         match method.strategy:

@@ -12,13 +12,14 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.angles import wrap360
 from hbr.dense.pixel_fit import LocalView
+from hbr.dense.session import Asking, answered
 from rig.bench import Bench, Placer
 from rig.catalog import Catalog, Provenance
 from rig.catalog.journal import open_for_enrollment
@@ -79,8 +80,8 @@ class ViewsAtRest:
     ----------
     check
         Gets image and azimuth of the first view, and raises an error if it shows no object.
-    model
-        Brings the enrolled views.
+    compared
+        Takes a step of the search that asks for enrolled views.
     live
         Called with the event of each frame of a search in motion.
     number
@@ -96,7 +97,7 @@ class ViewsAtRest:
     viewer: Viewer
     describe: SearchDescriber
     check: Callable[[NDArray[np.uint8], float], None]
-    model: Model
+    compared: Callable[[Asking[Event | None]], Generator[Event, None, None]]
     live: Callable[[FrameUsed], object]
     first_rest_s: float = FIRST_REST_S
     number: int = 0
@@ -108,7 +109,6 @@ class ViewsAtRest:
     locks: CameraLocks = field(init=False)
     unseen: list[Event] = field(default_factory=list)
     _orientation_deg: float = field(init=False)
-    _missing: CatalogError | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.table = Turntable(self.bench, first_rest_s=self.first_rest_s)
@@ -144,28 +144,11 @@ class ViewsAtRest:
         self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
         if (changed := self.search.changed()) is not None:
             yield changed
-        yield from self._verified()
+        yield from self.compared(self.search.verify(self.describe.hypotheses))
         ranked, step = self.search.decide()
         self.ended_ns, self.is_over = self.bench.clock.now_ns(), isinstance(step, Finish)
         if self.search.is_new_decision:
             yield ranked
-
-    def _verified(self) -> Generator[Event, None, None]:
-        """Compare the views with enrolled ones; if an image is missing, the search decides without it."""
-        known = self._missing
-        verified = self.search.verify(self.describe.hypotheses, self._enrolled)
-        if known is None and self._missing is not None:  # only the first one is reported
-            yield Warned(None, Note(NoteCode.NOT_COMPARED, _said(self._missing)))
-        if verified is not None:
-            yield verified
-
-    def _enrolled(self, object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
-        read = self.model.leader_views
-        try:
-            return None if read is None else read(self.search.names[object_index], azimuths_deg)
-        except CatalogError as error:
-            self._missing = error
-            return None
 
     def rotate(self, step: Rotate) -> Generator[Event, None, None]:
         """Rotate to the next view: within the cable budget, and use the measured rotation.
@@ -367,7 +350,8 @@ def identify(
     )
     # Take views until the search ends.
     kind = ViewsInMotion if search.in_motion else ViewsAtRest
-    views = kind(bench, search, viewer, describe, check, model, live)
+    compared = _Comparisons(model, search)
+    views = kind(bench, search, viewer, describe, check, compared, live)
     try:
         with views.table as table:
             yield from views.begin()
@@ -414,6 +398,38 @@ def _unwound(number: int, table: Turntable) -> Generator[Event, None, RigError |
     except RigError as error:
         return error
     return None
+
+
+@dataclass(eq=False)
+class _Comparisons:
+    """Takes the steps of a search that ask for enrolled views, and yields their events.
+
+    If an enrolled image is missing, the search decides without it; only the first one is reported.
+    """
+
+    model: Model
+    search: Search
+    _missing: CatalogError | None = field(default=None, init=False)
+
+    def __call__(self, step: Asking[Event | None]) -> Generator[Event, None, None]:
+        known = self._missing
+        event = answered(step, self._enrolled)
+        if known is None and self._missing is not None:
+            values = {key: value for key, value in self._missing.as_dict().items() if key in _SAID}
+            yield Warned(None, Note(NoteCode.NOT_COMPARED, values))
+        if event is not None:
+            yield event
+
+    def _enrolled(self, object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
+        read, name = self.model.leader_views, self.search.names[object_index]
+        try:
+            return None if read is None else read(name, azimuths_deg)
+        except CatalogError as error:
+            self._missing = error
+            return None
+
+
+_SAID: Final = ("what", "next_step", "steps")
 
 
 def watch(
@@ -523,9 +539,10 @@ class ResultRecorder:
                 with open_for_enrollment(CatalogPlace.of(self.place), self.clock) as journal:
                     return Recorded(record(journal, new, self._image), self.sample)
         except RigError as error:
-            return Warned(None, Note(NoteCode.NOT_RECORDED, _said(error)))
-
-
-def _said(error: RigError) -> dict[str, Any]:
-    """Return what a note says about an error."""
-    return {"what": error.what, "next_step": error.next_step, "steps": steps_as_json(error.steps)}
+            return Warned(
+                None,
+                Note(
+                    NoteCode.NOT_RECORDED,
+                    {"what": error.what, "next_step": error.next_step, "steps": steps_as_json(error.steps)},
+                ),
+            )

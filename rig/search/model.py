@@ -5,7 +5,7 @@
 Decision: docs/decisions/0017.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.dense.arc import ArcSession
-from hbr.dense.pixel_fit import LocalView
 from hbr.paper.hmm import PoseModel
 from rig.bench import Bench
 from rig.catalog import Catalog, derived, sessions
@@ -26,7 +25,7 @@ from rig.config import RigConfig
 from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
-from rig.search.session import SHOWN, DenseSearch, HoughSearch, PoseSearch, Search
+from rig.search.session import SHOWN, DenseSearch, EnrolledViews, HoughSearch, PoseSearch, Search
 from rig.search.strategies import AnyStrategy, descriptor_for, has_poses, is_in_motion, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR, DENSE_DESCRIPTORS
@@ -59,7 +58,7 @@ class Model:
     with_empty_table: bool | None = None
     camera: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
     empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
-    leader_views: Callable[[str, Sequence[float]], Sequence[LocalView]] | None = field(default=None, repr=False)
+    leader_views: EnrolledViews | None = field(default=None, repr=False)
 
     @property
     def views(self) -> hbr.Views:

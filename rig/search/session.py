@@ -1,15 +1,15 @@
 """A search without its hardware: views in, ranking and decision out.
 
-A search does no I/O. It takes a view (`Search.add`), compares it with enrolled views that the driver brings
-(`Search.verify`), and says what it needs next (`Search.decide`): a view after a rotation, or the end. Then it answers
-(`Search.answer`). The bench at rest and in motion (`rig.plans.identify`) and the replay (`rig.search.replay`) drive it;
-`rig eval` drives the same `hbr.DenseSession`.
+A search does no I/O. It takes a view (`Search.add`), asks for enrolled views to compare it with (`Search.verify`), and
+says what it needs next (`Search.decide`): a view after a rotation, or the end. Then it answers (`Search.answer`). The
+bench at rest and in motion (`rig.plans.identify`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the
+same `hbr.DenseSession`.
 
 Decision: docs/decisions/0017.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -21,7 +21,7 @@ from hbr.core.angles import wrap360
 from hbr.dense.arc import ArcSession
 from hbr.dense.pixel_fit import LocalView, PixelFit
 from hbr.dense.pose import azimuth_of, pose
-from hbr.dense.session import EnrolledViews
+from hbr.dense.session import Asking, Queries
 from hbr.model.symmetry import symmetry
 from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from rig.config import RigConfig
@@ -52,6 +52,10 @@ from rig.search.strategies import (
 )
 from rig.views.capture import RejectReason
 from rig.views.description import DescribedView
+
+EnrolledViews = Callable[[str, Sequence[float]], Sequence[LocalView]]
+"""Returns the enrolled views of an object near some azimuths."""
+
 
 SHOWN: Final = 5
 """Candidates that an event names by default."""
@@ -119,10 +123,6 @@ class Search(ABC):
         assert self.step is not None
         return self.ranked, self.step
 
-    def verified_before(self, saved: Verified) -> Verified | None:  # noqa: ARG002
-        """Use the fit of a saved event instead of enrolled views, which a saved run does not have."""
-        return None
-
     @abstractmethod
     def _add(self, view: DescribedView) -> None: ...
 
@@ -157,9 +157,9 @@ class Search(ABC):
         """Return the event if the last view shows that the object changed; the search has then begun again."""
         return None
 
-    def verify(self, hypotheses: Hypotheses, enrolled: EnrolledViews) -> Verified | None:  # noqa: ARG002
+    def verify(self, hypotheses: Hypotheses, measured: PixelFit | None = None) -> Asking[Verified | None]:  # noqa: ARG002
         """Compare the last views with the leader's, as `hbr.DenseSession.verify`; the decision depends on it."""
-        return None
+        return _no_step()
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         """Return the answer after the last view."""
@@ -182,6 +182,10 @@ class Search(ABC):
             possible=(best.name,),
             note=end.note,
         )
+
+
+def _no_step() -> Asking[None]:
+    yield from ()
 
 
 def _min_score(views: hbr.Views, config: RigConfig) -> float:
@@ -413,19 +417,8 @@ class DenseSearch(Search):
             rng=self._rng,
         )
 
-    def verify(self, hypotheses: Hypotheses, enrolled: EnrolledViews) -> Verified | None:
-        own, orientations_deg = hypotheses[self._session.left_out :], self._orientations[self._session.left_out :]
-
-        def queries(n: int) -> list[LocalView]:
-            return [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
-
-        return self._verified(self._session.verify(queries, enrolled))
-
-    def verified_before(self, saved: Verified) -> Verified | None:
-        own = self.names.index(saved.name), saved.fit, saved.second, saved.others, saved.expected
-        return self._verified(self._session.use(PixelFit(*own)))
-
-    def _verified(self, found: PixelFit | None) -> Verified | None:
+    def verify(self, hypotheses: Hypotheses, measured: PixelFit | None = None) -> Asking[Verified | None]:
+        found = yield from self._session.verify(self._queries(hypotheses), measured)
         if found is None:
             return None
         decision = self._session.decision
@@ -440,6 +433,10 @@ class DenseSearch(Search):
             probability=decision.probability,
             not_enrolled=decision.not_enrolled,
         )
+
+    def _queries(self, hypotheses: Hypotheses) -> Queries:
+        own, orientations_deg = hypotheses[self._session.left_out :], self._orientations[self._session.left_out :]
+        return lambda n: [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)

@@ -1,7 +1,5 @@
 """The comparison after a view at rest: the search asks for enrolled views, and its decision depends on them."""
 
-from typing import NoReturn
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,9 @@ import hbr
 from hbr import Outcome
 from hbr.dense.arc import ArcSession
 from hbr.dense.pixel_fit import PixelFit
+from hbr.dense.session import NeedEnrolledViews, answered
 from hbr.dense.stopping import decide
 from tests.hbr.dense.searches import catalog, found_from
-
-
-def no_view(*_: object) -> NoReturn:
-    pytest.fail("no view is needed")
 
 
 @pytest.fixture
@@ -33,20 +28,24 @@ def session() -> hbr.DenseSession:
 @pytest.mark.parametrize(("by", "outcome"), [(0.0, Outcome.AMBIGUOUS), (0.02, Outcome.AMBIGUOUS), (0.3, Outcome.FOUND)])
 def test_near_twins_are_ambiguous_unless_the_pixels_separate_them(session, by: float, outcome: Outcome) -> None:
     for twin in (0, 4):
-        session.use(PixelFit(twin, 0.9, 0.9 - by, 0.2, 0.9))
+        answered(session.verify(lambda _: [], PixelFit(twin, 0.9, 0.9 - by, 0.2, 0.9)))
         assert (session.end().outcome, session.end().object_index) == (outcome, twin if by else 0)
 
 
 def test_without_enrolled_views_the_decision_stays(session) -> None:
     before = session.end()
-    asked = []
-    assert session.verify(no_view, lambda *asking: asked.append(asking)) is None
-    assert asked[0][0] == before.object_index  # first the leader
+    step = session.verify(lambda _: pytest.fail("no view is needed"))
+    assert isinstance(next(step), NeedEnrolledViews)
+    with pytest.raises(StopIteration) as end:
+        step.send(None)
+    assert end.value.value is None
     assert session.end() == before
 
 
 def test_a_search_at_rest_is_verified_unless_its_object_is_hardly_enrolled(session) -> None:
     views = session.belief.index.views
+    need = next(session.verify(lambda _: pytest.fail("first it asks")))
+    assert need.object_index == session.end().object_index
     moving = ArcSession(session.belief.index)
     moving.add(views.levels(np.array([0]))[0], 0.0)
     unknown = hbr.DenseSession(session.belief.index)
@@ -55,7 +54,7 @@ def test_a_search_at_rest_is_verified_unless_its_object_is_hardly_enrolled(sessi
     assert unknown.end().outcome is Outcome.UNKNOWN
     for one in (moving, unknown):
         before = one.end()
-        assert one.verify(no_view, no_view) is None
+        assert answered(one.verify(lambda _: pytest.fail("no view is needed"))) is None
         assert (one.verification, one.end()) == (None, before)
 
 
@@ -63,7 +62,7 @@ def test_a_measured_fit_replaces_the_enrolled_views(session) -> None:
     found = []
     for own in (0.1, 0.5, 0.9):
         measured = PixelFit(session.end().object_index, own, 0.3, 0.3, 0.8)
-        assert session.use(measured) is measured
+        assert answered(session.verify(lambda _: pytest.fail("no view is needed"), measured)) is measured
         assert session.decision == session.present == decide(session.belief, last=True, fit=measured)
         found.append(session.end().not_enrolled)
     assert found == sorted(found, reverse=True)
@@ -79,5 +78,5 @@ def test_a_good_fit_ends_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
     found_from(monkeypatch, with_fit)
     session = hbr.DenseSession(index)
     assert session.add(index.views.levels(np.array([0]))[0], 0.0).outcome is Outcome.CONTINUE
-    session.use(PixelFit(0, 0.95, 0.2, 0.2, 0.9))
+    answered(session.verify(lambda _: [], PixelFit(0, 0.95, 0.2, 0.2, 0.9)))
     assert session.decision.outcome is session.end().outcome is Outcome.FOUND

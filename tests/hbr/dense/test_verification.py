@@ -11,7 +11,7 @@ import pytest
 from hbr import Belief, DenseIndex, Views, update_belief
 from hbr.core.angles import wrap180
 from hbr.dense.pixel_fit import LocalView, Pixels, fit
-from hbr.dense.session import verify
+from hbr.dense.session import answered, verify
 from tests.hbr.dense.searches import catalog
 
 SIDE = 160
@@ -87,7 +87,7 @@ def test_the_leader_is_compared_at_its_pose_with_the_better_segmentation(index: 
         asked[leader] = list(azimuths_deg)
         return [replace(painted(leader), azimuth_deg=azimuth_deg) for azimuth_deg in azimuths_deg]
 
-    found = verify(so_far, lambda _: [painted(9), painted(2)], enrolled)
+    found = answered(verify(so_far, lambda _: [painted(9), painted(2)]), enrolled)
     assert found is not None
     assert len(asked) == 3  # the leader and the next two candidates
     assert np.allclose(wrap180(asked[2] - views.azimuth_deg[rows]), 0, atol=15)
@@ -110,10 +110,10 @@ def test_the_second_candidate_leads_if_it_fits_better_and_a_twin_is_no_other_can
         return [replace(view, azimuth_deg=azimuth_deg) for azimuth_deg in azimuths_deg]
 
     for better in (first, second):
-        found = verify(belief, lambda _: [painted(better)], partial(enrolled, shown_as={}))  # noqa: B023
+        found = answered(verify(belief, lambda _: [painted(better)]), partial(enrolled, shown_as={}))  # noqa: B023
         assert found is not None
         assert found.object_index == better
         assert found.own > 0.9 > found.second
-    same = verify(belief, lambda _: [painted(first)], partial(enrolled, shown_as={second: first}))
+    same = answered(verify(belief, lambda _: [painted(first)]), partial(enrolled, shown_as={second: first}))
     assert same is not None
     assert same.second > 0.9 > same.others
