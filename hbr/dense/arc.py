@@ -20,7 +20,7 @@ from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import Belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.next_view import SHARPNESS, NextBestView, log_confusion, pairs_after
+from hbr.dense.next_view import SHARPNESS, NextBestView, log_confusion, pairs_after, strongest
 from hbr.dense.session import MOST_CHANGES, DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StopReason, decide
 
@@ -108,7 +108,7 @@ def next_arc(belief: Belief, *, rotations_deg: FloatArray, seconds: FloatArray) 
     here_deg = float(belief.orientation_deg[-1])
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
-    pairs = pairs_after(belief, rotations_deg)
+    pairs = pairs_after(belief, rotations_deg, strongest(belief.posterior))
     is_one = not pairs.probability.any()  # one object alone: a new side helps to find its azimuth
     exponent = np.zeros_like(pairs.similar) if is_one else new[:, None] * pairs.known * (1 - pairs.similar)
     confusion = np.zeros(len(rotations_deg))
@@ -119,7 +119,7 @@ def next_arc(belief: Belief, *, rotations_deg: FloatArray, seconds: FloatArray) 
             confusion[way] = -SHARPNESS * np.cumsum(new[way])
         else:
             remaining = pairs.probability * np.exp(-SHARPNESS * np.cumsum(exponent[way], axis=0))
-            confusion[way] = log_confusion(remaining)
+            confusion[way] = log_confusion(2 * remaining.sum(axis=1))
     sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + seconds, np.inf)
     chosen = int((sums if np.isfinite(sums).any() else confusion + seconds).argmin())
     rotation_deg = float(rotations_deg[chosen])

@@ -31,6 +31,10 @@ ALL_ROTATIONS_DEG: Final = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1),
 ALL_ROTATIONS_DEG.flags.writeable = False
 
 
+Hypotheses = tuple[FloatArray, IndexArray, IndexArray]
+"""Probability, place of the object and bin of each hypothesis, (m,)."""
+
+
 @dataclass(frozen=True, eq=False)
 class NextBestView:
     """A rotation, or an arc of a search in motion, and the numbers of the decision for it.
@@ -113,14 +117,15 @@ def next_best_view(
     landing_deg = here_deg + angles_deg
     apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
-    pairs = pairs_after(belief, angles_deg)
+    hypotheses = strongest(belief.posterior)
+    pairs = pairs_after(belief, angles_deg, hypotheses)
     remaining = pairs.probability * np.exp(-SHARPNESS * (novelty[:, None] * pairs.known) * (1 - pairs.similar))
     confusion = 2 * remaining.sum(axis=1)
     odds = min(not_enrolled / max(1 - not_enrolled, _NEGLIGIBLE), _MOST_ODDS)
     if odds > _NEGLIGIBLE:
-        confusion += odds * _with_what_was_seen(belief, angles_deg, novelty)
+        confusion += odds * _with_what_was_seen(belief, angles_deg, novelty, hypotheses)
     # one enrolled object alone: a new side helps to find its azimuth
-    confusion = _logarithm(confusion) if confusion.any() else -SHARPNESS * novelty
+    confusion = log_confusion(confusion) if confusion.any() else -SHARPNESS * novelty
     # Choose the best one, and name the pair that it separates most.
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
@@ -132,16 +137,17 @@ def next_best_view(
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
 
 
-def _with_what_was_seen(belief: Belief, rotations_deg: FloatArray, novelty: FloatArray) -> FloatArray:
+def _with_what_was_seen(
+    belief: Belief, rotations_deg: FloatArray, novelty: FloatArray, hypotheses: Hypotheses
+) -> FloatArray:
     """Return the confusion of the leader, (a,), with an object that looks like its views at the earlier queries."""
-    probability, place, bin_of = strongest(belief.posterior)
-    own = place == place[0]
-    probability, place, bin_of = probability[own], place[own], bin_of[own]
+    own = hypotheses[1] == hypotheses[1][0]
+    probability, place, bin_of = (part[own] for part in hypotheses)
     rows, away_deg = expected_views(belief, place, bin_of, rotations_deg)
     seen, _ = expected_views(belief, place, bin_of, belief.orientation_deg - belief.orientation_deg[-1])
     known = np.exp(-0.5 * (away_deg / _NEAR_DEG) ** 2)
     vectors, largest = belief.index.vectors, belief.index.space.largest.sum()
-    similar = np.einsum("amd,qmd->aqm", vectors[rows], vectors[seen]).max(axis=1) / largest
+    similar = (vectors[rows.T] @ vectors[seen.T].transpose(0, 2, 1)).max(axis=2).T / largest
     confusion: FloatArray = np.exp(-SHARPNESS * novelty[:, None] * known * (1 - similar)) @ probability
     return confusion
 
@@ -171,9 +177,9 @@ class Pairs(NamedTuple):
         return int(self.objects[0, place]), int(self.objects[1, place])
 
 
-def pairs_after(belief: Belief, rotations_deg: FloatArray) -> Pairs:
+def pairs_after(belief: Belief, rotations_deg: FloatArray, hypotheses: Hypotheses) -> Pairs:
     """Return the pairs of strong hypotheses, after each of some rotations, float64 (a,)."""
-    probability, place, bin_of = strongest(belief.posterior)
+    probability, place, bin_of = hypotheses
     first, second = _all_pairs(len(place))
     different = place[first] != place[second]
     first, second = first[different], second[different]
@@ -188,12 +194,8 @@ def pairs_after(belief: Belief, rotations_deg: FloatArray) -> Pairs:
     )
 
 
-def log_confusion(remaining: FloatArray) -> FloatArray:
-    """Return the logarithm of the probability of a confusion, (a,), from what remains of each pair, (a, p)."""
-    return _logarithm(2 * remaining.sum(axis=1))
-
-
-def _logarithm(confusion: FloatArray) -> FloatArray:
+def log_confusion(confusion: FloatArray) -> FloatArray:
+    """Return the logarithm of the probability of a confusion, (a,); also of 0."""
     logarithm: FloatArray = np.log(np.maximum(confusion, 1e-300))
     return logarithm
 
@@ -204,7 +206,7 @@ def _all_pairs(count: int) -> tuple[IndexArray, IndexArray]:
     return np.triu_indices(count, 1)
 
 
-def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
+def strongest(posterior: FloatArray) -> Hypotheses:
     """Return the probability, the place of the object and the bin of the strongest hypotheses, the strongest first.
 
     Each of them is a peak of its object's probability; it represents the slopes beside it.
