@@ -129,7 +129,6 @@ class OpenCvCamera:
         self._settings = settings or CameraConfig()
         self._missing = capture.get(_UNKNOWN_PROPERTY)
         self.modes = modes_of(capture)
-        self.controls: tuple[v4l2.VideoControl, ...] = capture.controls() if hasattr(capture, "controls") else ()
         self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
         self.returns = 0
         self._clock = clock
@@ -184,6 +183,12 @@ class OpenCvCamera:
                     "time-out.",
                     evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
                 )
+
+    @property
+    def controls(self) -> tuple[v4l2.VideoControl, ...]:
+        """The controls that the camera offers, with their present values; none if the source does not tell."""
+        found: tuple[v4l2.VideoControl, ...] = self._capture.controls() if hasattr(self._capture, "controls") else ()
+        return found
 
     def read_locks(self) -> CameraLocks:
         reported = {name: (self._known(prop), convert) for name, (prop, convert) in _LOCKS.items()}

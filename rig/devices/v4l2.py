@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from fcntl import ioctl
 from pathlib import Path
+from typing import Any
 
 CAPTURE, CAPTURE_MPLANE = 0x0000_0001, 0x0000_1000
 M2M_MPLANE, M2M = 0x0000_4000, 0x0000_8000
@@ -146,11 +147,8 @@ def controls(path: Path) -> tuple[VideoControl, ...]:
     """Return the controls of a device, in the order of their numbers."""
     found: list[VideoControl] = []
     number = 0
-    while (answer := _ask(path, _QUERYCTRL, _RANGE.pack(number | _NEXT, 0, b"", 0, 0, 0, 0, 0))) is not None:
-        following, kind, name, low, high, step, default, flags = _RANGE.unpack(answer)
-        if following <= number:  # a driver that repeats itself
-            break
-        number = following
+    while (answer := _range(path, number | _NEXT)) is not None and answer[0] > number:  # a driver may repeat itself
+        number, kind, name, low, high, step, default, flags = answer
         if kind != _CLASS and not flags & _DISABLED:
             text = name.split(b"\0")[0].decode("ascii", "replace")
             found.append(VideoControl(number, text, low, high, step, default, get_control(path, number)))
@@ -159,11 +157,14 @@ def controls(path: Path) -> tuple[VideoControl, ...]:
 
 def control_limits(path: Path, control: int) -> tuple[int, int] | None:
     """Return the smallest value and the step of a control; None if the device lacks it."""
-    answer = _ask(path, _QUERYCTRL, _RANGE.pack(control, 0, b"", 0, 0, 0, 0, 0))
-    if answer is None:
-        return None
-    smallest, _, step = _RANGE.unpack(answer)[3:6]
-    return int(smallest), int(step)
+    answer = _range(path, control)
+    return None if answer is None else (answer[3], answer[5])
+
+
+def _range(path: Path, number: int) -> tuple[Any, ...] | None:
+    """Return the fields of `_RANGE` of a control; None if there is none."""
+    answer = _ask(path, _QUERYCTRL, _RANGE.pack(number, 0, b"", 0, 0, 0, 0, 0))
+    return None if answer is None else _RANGE.unpack(answer)
 
 
 def set_control(path: Path, control: int, value: int) -> bool:

@@ -48,7 +48,7 @@ def charts(move: Mapping[str, Any], quiet_dps: float) -> list[Chart]:
     steps = [*(goal[0] for goal in goals[1:]), time[-1]]
     seconds, degrees = Axis("seconds"), Axis("°")
     lag = [
-        nan_if_none(profile) - encoder
+        _nan_if_none(profile) - encoder
         for profile, encoder in zip(move["profile_deg"], move["encoder_deg"], strict=True)
     ]
     drawn = [
@@ -77,7 +77,7 @@ def charts(move: Mapping[str, Any], quiet_dps: float) -> list[Chart]:
     return [chart for chart in drawn if any(np.isfinite(series.y).any() for series in chart.series)]
 
 
-def nan_if_none(value: float | None) -> float:
+def _nan_if_none(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
