@@ -13,6 +13,7 @@ from sqlalchemy import (
     JSON,
     BigInteger,
     Boolean,
+    ColumnElement,
     DateTime,
     Dialect,
     Float,
@@ -29,6 +30,8 @@ from rig.core.errors import CatalogDamaged
 
 FIX = "Use a backup of the catalog; if you received it, ask the sender for an exported bundle instead."
 
+_IMAGE_NAME: Final = re.compile(r"[0-9a-f]{64}\.(png|jpg)")
+
 
 def damaged(what: str, found: object) -> CatalogDamaged:
     """Return the error for a value that this program would not have stored."""
@@ -38,171 +41,101 @@ def damaged(what: str, found: object) -> CatalogDamaged:
     )
 
 
-_IMAGE_NAME: Final = re.compile(r"[0-9a-f]{64}\.(png|jpg)")
+class Column(TypeDecorator[Any]):
+    """A type of SQLAlchemy whose values are checked when they are read; NULL is left to the definition of the column.
 
-
-class _Checked(TypeDecorator[Any]):
-    """A column whose values are checked when they are read; NULL is left to the definition of the column.
-
-    ``kind`` is the type of a value. Subclasses that need more than that check it in `check`, or in their conversion.
+    ``accept`` returns a value as the program uses it. It raises ValueError or TypeError for one that this program would
+    not have stored.
     """
 
-    kind: type = object
+    impl = Text
+    cache_ok = True
 
-    def __init_subclass__(cls) -> None:
-        cls.cache_ok = True  # SQLAlchemy does not inherit it
+    def __init__(self, stored: TypeEngine[Any], accept: Callable[[Any], Any]) -> None:
+        super().__init__()
+        self.impl = self.stored = stored  # type: ignore[assignment] # SQLAlchemy's own constructor does this, too
+        self.accept = accept
 
-    def check(self, value: Any) -> None:
-        """Raise ValueError or TypeError for a value that this program would not have stored."""
-        if not isinstance(value, self.kind):
-            raise TypeError(f"a value that should be of type {self.kind.__name__}")
+    def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
+        if not isinstance(self.stored, String):
+            return self.stored
+        # The order of texts is that of their code points, for any language of the server.
+        return type(self.stored)(self.stored.length, collation="C" if dialect.name == "postgresql" else None)
+
+    def coerce_compared_value(self, op: Any, value: Any) -> TypeEngine[Any]:
+        return self.stored.coerce_compared_value(op, value) if isinstance(self.stored, JSON) else self
+
+    def process_bind_param(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002
+        if isinstance(value, datetime):  # SQLite would drop the zone
+            return value.astimezone(UTC).replace(tzinfo=None)
+        # SQLite stores −0.0 as 0.0, so every engine does: equal rows have equal digests.
+        return value + 0.0 if isinstance(value, float) else value
 
     def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[Any], Any]:
         convert = super().result_processor(dialect, coltype)
-        check = self.check
 
         def process(value: Any) -> Any:
             if value is None:
                 return None
             try:
                 found = value if convert is None else convert(value)
-                check(found)
+                return None if found is None else self.accept(found)
             except (ValueError, TypeError, OverflowError, RecursionError, AttributeError) as error:
                 raise damaged(str(error) or "a value", value) from error
-            return found
 
         return process
 
 
-class Utc(_Checked):
-    """Time with a time zone, stored as UTC. SQLite itself would drop the zone."""
-
-    impl = DateTime
-
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
-        return value if value is None else value.astimezone(UTC).replace(tzinfo=None)
-
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
-        return value if value is None else value.replace(tzinfo=UTC)
+def stored_type(column: ColumnElement[Any]) -> TypeEngine[Any]:
+    """Return the type that the database gives a column."""
+    return column.type.stored if isinstance(column.type, Column) else column.type
 
 
-class Words(_Checked):
-    """Text. Its order is that of its code points, for any language of the server."""
+def _of_type(kind: type) -> Callable[[Any], Any]:
+    def accept(value: Any) -> Any:
+        if not isinstance(value, kind):
+            raise TypeError(f"a value that should be of type {kind.__name__}")
+        return value
 
-    impl: type[String] = Text
-    kind = str
-
-    def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
-        own: Any = self.impl_instance
-        stored: TypeEngine[Any] = type(own)(own.length, collation="C" if dialect.name == "postgresql" else None)
-        return stored
+    return accept
 
 
-class Name(Words):
-    """Text of limited length."""
-
-    impl = String
+_text, _list = _of_type(str), _of_type(list)
 
 
-class StatusColumn(_Checked):
-    """An `EnrollmentStatus`."""
-
-    impl = Text
-
-    def process_result_value(self, value: str | None, dialect: Dialect) -> EnrollmentStatus | None:  # noqa: ARG002
-        return None if value is None else EnrollmentStatus(value)
+def image_name(value: Any) -> str:
+    """Return a name of an image: the SHA-256 of its bytes, and the suffix of its format."""
+    if not _IMAGE_NAME.fullmatch(_text(value)):
+        raise ValueError("a name that is not one of an image")
+    return str(value)
 
 
-class ImageName(_Checked):
-    """Name of an image: the SHA-256 of its bytes, and the suffix of its format."""
-
-    impl = String(68)
-    kind = str
-
-    def check(self, value: Any) -> None:
-        super().check(value)
-        if not _IMAGE_NAME.fullmatch(value):
-            raise ValueError("a name that is not one of an image")
-
-
-class Number(_Checked):
-    """A finite number. SQLite stores −0.0 as 0.0, so every engine does: equal rows have equal digests."""
-
-    impl = Float
-
-    def process_bind_param(self, value: float | None, dialect: Dialect) -> float | None:  # noqa: ARG002
-        return value if value is None else value + 0.0
-
-    def check(self, value: Any) -> None:
-        _check_number(value)
-
-
-class Count(_Checked):
-    """An integer."""
-
-    impl = Integer
-    kind = int
-
-
-class Nanoseconds(Count):
-    """An integer of 64 bits."""
-
-    impl = BigInteger
-
-
-class TruthColumn(_Checked):
-    """True or false."""
-
-    impl = Boolean
-    kind = bool
-
-
-class Bytes(_Checked):
-    """Bytes."""
-
-    impl = LargeBinary
-    kind = bytes
-
-
-class JsonText(_Checked):
-    """JSON, stored as its text."""
-
-    impl = JSON
-
-    def coerce_compared_value(self, op: Any, value: Any) -> TypeEngine[Any]:
-        return self.impl_instance.coerce_compared_value(op, value)
-
-
-class JsonMapping(JsonText):
-    """A JSON object."""
-
-    kind = dict
-
-
-class Azimuths(JsonText):
-    """A tuple of azimuths as JSON."""
-
-    def process_result_value(self, value: Any, dialect: Dialect) -> tuple[float, ...]:  # noqa: ARG002
-        if not isinstance(value, list):
-            raise TypeError("a value that should be of type list")
-        return tuple(value)
-
-    def check(self, value: Any) -> None:
-        for azimuth_deg in value:
-            _check_number(azimuth_deg)
-
-
-class RegionOfImage(JsonText):
-    """A `Region` as JSON."""
-
-    def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002
-        return None if value is None else tuple(value)
-
-    def check(self, value: Any) -> None:
-        if value is not None and not is_region(value):
-            raise ValueError("a region that is not one")
-
-
-def _check_number(value: object) -> None:
+def _number(value: Any) -> Any:
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         raise ValueError("a value that should be a finite number")
+    return value
+
+
+def _region(value: Any) -> tuple[int, ...]:
+    if not is_region(value):
+        raise ValueError("a region that is not one")
+    return tuple(value)
+
+
+def limited(length: int) -> Column:
+    """Return the type of a text of limited length."""
+    return Column(String(length), _text)
+
+
+UTC_TIME: Final = Column(DateTime(), lambda value: value.replace(tzinfo=UTC))
+TEXT: Final = Column(Text(), _text)
+STATUS: Final = Column(Text(), EnrollmentStatus)
+IMAGE_NAME: Final = Column(String(68), image_name)
+NUMBER: Final = Column(Float(), _number)
+COUNT: Final = Column(Integer(), _of_type(int))
+NANOSECONDS: Final = Column(BigInteger(), _of_type(int))
+TRUTH: Final = Column(Boolean(), _of_type(bool))
+BYTES: Final = Column(LargeBinary(), _of_type(bytes))
+JSON_OBJECT: Final = Column(JSON(none_as_null=True), _of_type(dict))
+AZIMUTHS: Final = Column(JSON(), lambda value: tuple(map(_number, _list(value))))
+REGION: Final = Column(JSON(none_as_null=True), _region)

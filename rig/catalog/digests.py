@@ -6,12 +6,26 @@ from itertools import groupby
 from operator import itemgetter
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Integer, Select, Text, bindparam, cast, func, select, type_coerce
+from sqlalchemy import (
+    JSON,
+    Boolean,
+    ColumnElement,
+    DateTime,
+    Float,
+    Integer,
+    Select,
+    Text,
+    bindparam,
+    cast,
+    func,
+    select,
+    type_coerce,
+)
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased
 from sqlalchemy.types import NullType
 
-from rig.catalog.columns import JsonText, Number, TruthColumn, Utc
+from rig.catalog.columns import stored_type
 from rig.catalog.facts import Enrollment, Entry, Row, Session, View, digested, sha256_of
 from rig.catalog.jobs import portions
 
@@ -80,10 +94,14 @@ def _raw(is_postgres: bool, table: type[Row]) -> list[ColumnElement[Any]]:
 
 
 def _as_stored(column: ColumnElement[Any], is_postgres: bool) -> ColumnElement[Any]:
-    if is_postgres and isinstance(column.type, Utc):
-        return func.to_char(column, "YYYY-MM-DD HH24:MI:SS.US")
-    if is_postgres and isinstance(column.type, JsonText | TruthColumn):
-        return cast(column, Text if isinstance(column.type, JsonText) else Integer)
-    if isinstance(column.type, Number):
-        return type_coerce(column, NullType()) + 0.0 if is_postgres else type_coerce(column, NullType())
+    if is_postgres:
+        match stored_type(column):
+            case DateTime():
+                return func.to_char(column, "YYYY-MM-DD HH24:MI:SS.US")
+            case JSON():
+                return cast(column, Text)
+            case Boolean():
+                return cast(column, Integer)
+            case Float():
+                return type_coerce(column, NullType()) + 0.0
     return type_coerce(column, NullType())

@@ -16,6 +16,7 @@ from math import isfinite
 from typing import Any, Final
 
 from sqlalchemy import (
+    JSON,
     CheckConstraint,
     ColumnElement,
     ForeignKey,
@@ -29,21 +30,21 @@ from sqlalchemy import (
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, composite, mapped_column, relationship
 
 from rig.catalog.columns import (
-    Azimuths,
-    Bytes,
-    Count,
-    ImageName,
-    JsonMapping,
-    JsonText,
-    Name,
-    Nanoseconds,
-    Number,
-    RegionOfImage,
-    StatusColumn,
-    TruthColumn,
-    Utc,
-    Words,
+    AZIMUTHS,
+    BYTES,
+    COUNT,
+    IMAGE_NAME,
+    JSON_OBJECT,
+    NANOSECONDS,
+    NUMBER,
+    REGION,
+    STATUS,
+    TEXT,
+    TRUTH,
+    UTC_TIME,
     damaged,
+    limited,
+    stored_type,
 )
 from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus, JsonObject, Provenance, Region, is_region
 
@@ -91,8 +92,8 @@ class Property(Row):
     """A property of the whole catalog: its kind, its version, its id, and the last line of its log."""
 
     __tablename__ = "properties"
-    key: Mapped[str] = mapped_column(Words, primary_key=True)
-    value: Mapped[str] = mapped_column(Words)
+    key: Mapped[str] = mapped_column(TEXT, primary_key=True)
+    value: Mapped[str] = mapped_column(TEXT)
 
 
 class Entry(Row):
@@ -119,25 +120,25 @@ class Entry(Row):
 
     __tablename__ = "log"
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    time_utc: Mapped[datetime] = mapped_column(Utc)
-    user: Mapped[str] = mapped_column(Words)
-    host: Mapped[str] = mapped_column(Words)
-    software: Mapped[str] = mapped_column(Words)
-    action: Mapped[str] = mapped_column(Words)
-    object_name: Mapped[str | None] = mapped_column(Name(MAX_NAME_LENGTH), default=None)
-    object_id: Mapped[int | None] = mapped_column(Count, default=None)
-    label: Mapped[str | None] = mapped_column(Words, default=None)
-    note: Mapped[str | None] = mapped_column(Words, default=None)
-    deleted: Mapped[bool | None] = mapped_column(TruthColumn, default=None)
-    created_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
-    enrollment_id: Mapped[int | None] = mapped_column(Count, default=None)
-    status: Mapped[EnrollmentStatus | None] = mapped_column(StatusColumn, default=None)
-    finished_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
-    seal: Mapped[str | None] = mapped_column(Name(64), default=None)
-    result: Mapped[int | None] = mapped_column(Count, default=None, index=True)
-    details: Mapped[JsonObject] = mapped_column(JsonMapping, default_factory=dict)
-    record: Mapped[JsonObject | None] = mapped_column(JsonMapping(none_as_null=True), default=None)
-    digest: Mapped[str] = mapped_column(Name(64), init=False, default="")
+    time_utc: Mapped[datetime] = mapped_column(UTC_TIME)
+    user: Mapped[str] = mapped_column(TEXT)
+    host: Mapped[str] = mapped_column(TEXT)
+    software: Mapped[str] = mapped_column(TEXT)
+    action: Mapped[str] = mapped_column(TEXT)
+    object_name: Mapped[str | None] = mapped_column(limited(MAX_NAME_LENGTH), default=None)
+    object_id: Mapped[int | None] = mapped_column(COUNT, default=None)
+    label: Mapped[str | None] = mapped_column(TEXT, default=None)
+    note: Mapped[str | None] = mapped_column(TEXT, default=None)
+    deleted: Mapped[bool | None] = mapped_column(TRUTH, default=None)
+    created_utc: Mapped[datetime | None] = mapped_column(UTC_TIME, default=None)
+    enrollment_id: Mapped[int | None] = mapped_column(COUNT, default=None)
+    status: Mapped[EnrollmentStatus | None] = mapped_column(STATUS, default=None)
+    finished_utc: Mapped[datetime | None] = mapped_column(UTC_TIME, default=None)
+    seal: Mapped[str | None] = mapped_column(limited(64), default=None)
+    result: Mapped[int | None] = mapped_column(COUNT, default=None, index=True)
+    details: Mapped[JsonObject] = mapped_column(JSON_OBJECT, default_factory=dict)
+    record: Mapped[JsonObject | None] = mapped_column(JSON_OBJECT, default=None)
+    digest: Mapped[str] = mapped_column(limited(64), init=False, default="")
 
 
 class Enrollment(Row):
@@ -148,11 +149,11 @@ class Enrollment(Row):
 
     __tablename__ = "enrollments"
     id: Mapped[int] = mapped_column(primary_key=True, init=False)
-    key: Mapped[str] = mapped_column(Name(64), unique=True)
-    object_id: Mapped[int] = mapped_column(Count, index=True)
-    started_utc: Mapped[datetime] = mapped_column(Utc)
-    planned_azimuth_deg: Mapped[tuple[float, ...]] = mapped_column(Azimuths)
-    digest: Mapped[str] = mapped_column(Name(64), init=False, default="")
+    key: Mapped[str] = mapped_column(limited(64), unique=True)
+    object_id: Mapped[int] = mapped_column(COUNT, index=True)
+    started_utc: Mapped[datetime] = mapped_column(UTC_TIME)
+    planned_azimuth_deg: Mapped[tuple[float, ...]] = mapped_column(AZIMUTHS)
+    digest: Mapped[str] = mapped_column(limited(64), init=False, default="")
     sessions: Mapped[list["Session"]] = relationship(order_by="Session.number", init=False, repr=False)
     views: Mapped[list["View"]] = relationship(order_by="View.index", init=False, repr=False)
     __table_args__ = ({"sqlite_autoincrement": True},)  # no id is given twice, even after a removal
@@ -177,17 +178,17 @@ class Session(Row):
 
     __tablename__ = "sessions"
     enrollment_id: Mapped[int] = mapped_column(ForeignKey(Enrollment.id), primary_key=True, init=False, repr=False)
-    number: Mapped[int] = mapped_column(Count, primary_key=True)
-    started_utc: Mapped[datetime] = mapped_column(Utc)
+    number: Mapped[int] = mapped_column(COUNT, primary_key=True)
+    started_utc: Mapped[datetime] = mapped_column(UTC_TIME)
     provenance: Mapped[Provenance] = composite(
-        mapped_column("bench", Words),
-        mapped_column("devices", JsonMapping),
-        mapped_column("conditions", JsonMapping),
-        mapped_column("software", Words),
+        mapped_column("bench", TEXT),
+        mapped_column("devices", JSON_OBJECT),
+        mapped_column("conditions", JSON_OBJECT),
+        mapped_column("software", TEXT),
     )
-    empty_table: Mapped[str | None] = mapped_column(ImageName, default=None)
-    empty_table_bytes: Mapped[int | None] = mapped_column(Count, default=None, repr=False)
-    digest: Mapped[str] = mapped_column(Name(64), init=False, default="", repr=False)
+    empty_table: Mapped[str | None] = mapped_column(IMAGE_NAME, default=None)
+    empty_table_bytes: Mapped[int | None] = mapped_column(COUNT, default=None, repr=False)
+    digest: Mapped[str] = mapped_column(limited(64), init=False, default="", repr=False)
 
 
 class View(Row):
@@ -217,22 +218,22 @@ class View(Row):
     __tablename__ = "views"
     id: Mapped[int] = mapped_column(primary_key=True, init=False)
     enrollment_id: Mapped[int] = mapped_column(init=False, default=None)
-    index: Mapped[int] = mapped_column("view_index", Count, CheckConstraint("view_index >= 0", name="view_index"))
-    session: Mapped[int] = mapped_column(Count, init=False, default=0)
+    index: Mapped[int] = mapped_column("view_index", COUNT, CheckConstraint("view_index >= 0", name="view_index"))
+    session: Mapped[int] = mapped_column(COUNT, init=False, default=0)
     azimuth_deg: Mapped[float] = mapped_column(
-        Number, CheckConstraint("azimuth_deg >= 0 AND azimuth_deg < 360", name="azimuth_deg")
+        NUMBER, CheckConstraint("azimuth_deg >= 0 AND azimuth_deg < 360", name="azimuth_deg")
     )
-    commanded_deg: Mapped[float | None] = mapped_column(Number, default=None)
-    encoder_deg: Mapped[float | None] = mapped_column(Number, default=None)
-    imu_deg: Mapped[float | None] = mapped_column(Number, default=None)
-    imu_sigma_deg: Mapped[float | None] = mapped_column(Number, default=None)
-    captured_ns: Mapped[int | None] = mapped_column(Nanoseconds, default=None)
-    captured_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
-    evidence: Mapped[JsonObject] = mapped_column(JsonMapping, default_factory=dict)
-    region: Mapped[Region | None] = mapped_column(RegionOfImage(none_as_null=True), default=None)
-    image: Mapped[str] = mapped_column(ImageName, default="")
-    image_bytes: Mapped[int] = mapped_column(Count, default=0)
-    digest: Mapped[str] = mapped_column(Name(64), init=False, default="", repr=False)
+    commanded_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
+    encoder_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
+    imu_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
+    imu_sigma_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
+    captured_ns: Mapped[int | None] = mapped_column(NANOSECONDS, default=None)
+    captured_utc: Mapped[datetime | None] = mapped_column(UTC_TIME, default=None)
+    evidence: Mapped[JsonObject] = mapped_column(JSON_OBJECT, default_factory=dict)
+    region: Mapped[Region | None] = mapped_column(REGION, default=None)
+    image: Mapped[str] = mapped_column(IMAGE_NAME, default="")
+    image_bytes: Mapped[int] = mapped_column(COUNT, default=0)
+    digest: Mapped[str] = mapped_column(limited(64), init=False, default="", repr=False)
     __table_args__ = (
         UniqueConstraint("enrollment_id", "view_index"),
         ForeignKeyConstraint(["enrollment_id"], [Enrollment.id]),
@@ -273,11 +274,11 @@ class Derived(Row):
     """
 
     __tablename__ = "derived"
-    seal: Mapped[str] = mapped_column(Name(64), primary_key=True)
-    what: Mapped[str] = mapped_column(Name(100), primary_key=True)
-    made_by: Mapped[str] = mapped_column(Words)
-    content: Mapped[bytes] = mapped_column(Bytes)
-    sha256: Mapped[str] = mapped_column(Name(64))
+    seal: Mapped[str] = mapped_column(limited(64), primary_key=True)
+    what: Mapped[str] = mapped_column(limited(100), primary_key=True)
+    made_by: Mapped[str] = mapped_column(TEXT)
+    content: Mapped[bytes] = mapped_column(BYTES)
+    sha256: Mapped[str] = mapped_column(limited(64))
 
 
 FACTS: Final[tuple[type[Row], ...]] = (Entry, Enrollment, Session, View)
@@ -355,7 +356,7 @@ def _as_stored(column: ColumnElement[Any], value: Any) -> Any:
     """Return a value as both databases give it without its type (`rig.catalog.digests`)."""
     if value is None:
         return None
-    if isinstance(column.type, JsonText):
+    if isinstance(stored_type(column), JSON):
         return json_text(value)
     if isinstance(value, datetime):
         return value.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import digests, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.columns import ImageName, damaged
+from rig.catalog.columns import damaged, image_name
 from rig.catalog.facts import Action, Entry
 from rig.catalog.images import path_of
 from rig.catalog.records import JsonObject, Provenance, RecordedOutcome, as_json
@@ -323,7 +323,7 @@ def _load(transaction: Transaction, wanted: ColumnElement[bool]) -> list[Result]
                 bench = Provenance(str(found["bench"]), found["devices"], found["conditions"], line.software)
                 version, image, later = str(found["catalog_version"]), found["image"], tuple(corrections[line.result])
                 if image is not None:
-                    ImageName().check(image)
+                    image_name(image)
                 answers.append(Result(line.result, *said, details, azimuths_deg, bench, version, image, later))
         except (KeyError, TypeError, ValueError, UsageError) as error:  # this program has not written it
             raise damaged(f"the record of result {line.result}", line.record) from error

@@ -1,16 +1,9 @@
-"""Image files of views: encoding, decoding and names; whether all rows of a JPEG file are there (ITU-T T.81).
-
-libjpeg fills missing rows with grey and reports them only as a line on stderr.
+"""Image files of views: encoding, decoding and names.
 
 Decision: docs/decisions/0009.
 """
 
 import hashlib
-import os
-import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -34,10 +27,7 @@ _JPEG: Final = b"\xff\xd8\xff"
 
 # JPEG markers (ITU T.81, table B.1): DHT, JPG and DAC lie between the frame headers SOF0 to SOF15
 _NO_FRAME: Final = (0xC4, 0xC8, 0xCC)
-_END: Final = 0xD9  # EOI and SOS
 _SCAN: Final = 0xDA
-_MORE: Final = bytes(range(254, 0, -5)) * 3
-"""Data that no decoder needs after the last block of a complete image."""
 
 # The fastest lossless settings for camera frames. The files are nearly the smallest, because noise hides the
 # repetitions that the other strategies search for. OpenCV before 4.12 chooses the filter itself.
@@ -106,8 +96,6 @@ def decode(content: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]
         raise BadImage("damaged") from error
     if image is None:
         raise BadImage("damaged")
-    if content.startswith(_JPEG) and not _is_complete(content, np.asarray(image, np.uint8)):
-        raise BadImage("truncated: its last rows are missing")
     return np.asarray(image, np.uint8)
 
 
@@ -134,91 +122,15 @@ def header(content: bytes) -> Header | None:
     return Header(int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big"), is_coloured)
 
 
-class _Segment(NamedTuple):
-    marker: int
-    at: int
-    """Position of the marker."""
-    data: bytes
-
-
 def _jpeg_header(content: bytes) -> Header | None:
-    """Return what the frame header (B.2.2) tells; None if there is none."""
-    for segment in _segments(content):
-        if 0xC0 <= segment.marker <= 0xCF and segment.marker not in _NO_FRAME and len(segment.data) >= 6:
-            height, width = (int.from_bytes(segment.data[at : at + 2], "big") for at in (1, 3))
-            return Header(width, height, is_coloured=segment.data[5] > 1)
-    return None
-
-
-def _is_complete(content: bytes, image_bgr: NDArray[np.uint8]) -> bool:
-    """Return whether a JPEG file that decodes to an image, uint8 (H, W, 3) BGR, contains all of its data.
-
-    The function checks two properties. First, the image decodes to the same pixels with more data before its end, so no
-    block lacks data. Second, the scans contain every coefficient of every component to its last bit.
-    """
-    segments = list(_segments(content))
-    if not segments or segments[-1].marker != _END or not _has_all_scans(segments):
-        return False
-    at = len(content[: segments[-1].at].rstrip(b"\xff"))  # fill bytes before a marker
-    with _quiet_stderr():
-        longer = cv2.imdecode(np.frombuffer(content[:at] + _MORE + content[at:], np.uint8), cv2.IMREAD_COLOR)
-    return longer is not None and np.array_equal(longer, image_bgr)
-
-
-def _segments(content: bytes) -> Iterator[_Segment]:
-    """Yield the segments from the start of the image to its end (B.1.1). The data of a scan belong to none."""
+    """Return what the frame header tells (ITU-T T.81, B.2.2); None if there is none before the first scan."""
     at = 2
-    while (at := content.find(b"\xff", at)) >= 0 and at + 1 < len(content):
+    while content[at : at + 1] == b"\xff" and len(content) >= at + 10:
         marker = content[at + 1]
-        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD7:  # a stuffed or fill byte, or a restart within a scan
-            at += 1 if marker == 0xFF else 2
-            continue
-        length = 0 if marker == _END else int.from_bytes(content[at + 2 : at + 4], "big")
-        yield _Segment(marker, at, content[at + 4 : at + 2 + length])
-        if marker == _END:
-            return
-        at += 2 + length
-
-
-def _has_all_scans(segments: list[_Segment]) -> bool:
-    components: set[int] = set()
-    progressive = False
-    done: set[tuple[int, int]] = set()
-    for segment in segments:
-        data = segment.data
-        if 0xC0 <= segment.marker <= 0xCF and segment.marker not in _NO_FRAME:
-            progressive = segment.marker in (0xC2, 0xC6, 0xCA, 0xCE)
-            components = set(data[6 : 6 + 3 * data[5] : 3]) if len(data) > 5 else set()
-        elif segment.marker == _SCAN and data and len(data) >= 4 + 2 * data[0]:
-            begin, end, precision = data[1 + 2 * data[0] : 4 + 2 * data[0]]
-            if not progressive:
-                begin, end, precision = 0, 63, 0
-            if precision & 0x0F == 0:  # the last bit of these coefficients
-                done |= {(one, k) for one in data[1 : 1 + 2 * data[0] : 2] for k in range(begin, min(end, 63) + 1)}
-    # The standard lets an encoder leave out coefficients that are all zero. No common one does, and a file that was cut
-    # between two scans looks the same.
-    return bool(components) and all((one, k) in done for one in components for k in range(64))
-
-
-@contextmanager
-def _quiet_stderr() -> Iterator[None]:
-    """Discard what libraries write about the added data, and pass on everything else that is written to stderr."""
-    try:
-        sys.stderr.flush()
-        kept = os.dup(2)
-    except (OSError, AttributeError, ValueError):  # there is no stderr
-        yield
-        return
-    try:
-        with tempfile.TemporaryFile() as caught:
-            os.dup2(caught.fileno(), 2)
-            try:
-                yield
-            finally:
-                os.dup2(kept, 2)
-            caught.seek(0)
-            other = b"".join(line for line in caught if not line.startswith(b"Corrupt JPEG data"))
-        with suppress(OSError):
-            os.write(kept, other)
-    finally:
-        os.close(kept)
+        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
+            height, width = (int.from_bytes(content[start : start + 2], "big") for start in (at + 5, at + 7))
+            return Header(width, height, is_coloured=content[at + 9] > 1)
+        if marker == _SCAN:
+            return None
+        at += 1 if marker == 0xFF else 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+    return None
