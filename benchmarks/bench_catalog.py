@@ -114,7 +114,7 @@ def imports(folder: Path, photographs: Path) -> None:
     bare_s, bare_cpu_s = bare_loop(files[:half])
     begin_ns, before_s = _CLOCK.now_ns(), cpu_s()
     with Catalog.open(folder / "coil", clock=_CLOCK) as catalog:
-        done = finished(transfer(read_folder(photographs, now=_CLOCK.utc()), catalog, descriptors=["cedd"]))
+        done = finished(transfer(read_folder(photographs, now=_CLOCK.utc()), catalog))
     import_s, import_cpu_s = seconds_between(begin_ns, _CLOCK.now_ns()), cpu_s() - before_s
     rest_s, rest_cpu_s = bare_loop(files[half:])
     bare_s, bare_cpu_s = bare_s + rest_s, bare_cpu_s + rest_cpu_s

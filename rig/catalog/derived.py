@@ -8,7 +8,6 @@ Decision: docs/decisions/0010.
 """
 
 from collections.abc import Callable, Generator, Sequence
-from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -17,65 +16,19 @@ from sqlalchemy import select
 import hbr
 from hbr.dense.pixel_fit import LocalView
 from hbr.dense.session import near
-from hbr.descriptors import descriptor
-from hbr.kernels.library import THREADS
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
-from rig.catalog.describing import (
-    SEGMENTATION,
-    Described,
-    Task,
-    contents_of,
-    describe,
-    describe_task,
-    evidence_of,
-    held_pixels,
-    known_descriptor,
-    records_of,
-    store,
-    stored_contents,
-    task_of,
-)
+from rig.catalog.describing import describe_one, described, known_descriptor, records_of, store, stored_contents
 from rig.catalog.facts import Enrollment, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, finished, processes
 from rig.catalog.records import Region
 from rig.config import ViewConfig
-from rig.core.errors import CatalogDamaged, CatalogError, RigError
+from rig.core.errors import CatalogDamaged, CatalogError
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
-from rig.views.description import (
-    BENCH_DESCRIPTOR,
-    DESCRIPTORS,
-    PAPER_DESCRIPTOR,
-    ViewDescriber,
-)
-
-
-def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str) -> Described:
-    """Return the stored description of an enrollment, or compute it; by `DESCRIPTORS` or those that are ``wanted``.
-
-    Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
-    """
-    kinds = wanted or DESCRIPTORS
-    seal = seal_of(enrollment)
-    with catalog.database.read() as transaction:
-        needed = kinds if all(descriptor(kind).whole_image for kind in kinds) else (SEGMENTATION, *kinds)
-        stored = {kind: found.get(seal, b"") for kind, found in stored_contents(transaction, [seal], needed).items()}
-    if all(stored.values()):
-        packed = {kind: records_of(descriptor(kind), stored[kind])["packed"].tobytes() for kind in kinds}
-        levels = {kind: descriptor(kind).unpack_rows(content) for kind, content in packed.items()}
-        count = len(enrollment.views)
-        # What this program has not made is computed again.
-        with suppress(ValueError, TypeError, AttributeError, RigError):
-            evidence = evidence_of(stored[SEGMENTATION], count) if SEGMENTATION in needed else ({},) * count
-            return Described(levels, evidence)
-    task = task_of(enrollment, seal, name, kinds)
-    with catalog.database.catalog_errors():
-        found = describe(held_pixels(catalog.database.images), task, threads=THREADS)
-    store(catalog.database, [(task, found)])
-    return found
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
 
 
 def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None, hbr.Views]:
@@ -87,23 +40,42 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
     described.
     """
     kind = known_descriptor(descriptor)
-    found: dict[str, bytes] = {}
-    wanted, tasks = _missing(catalog, kind.name, found)
-    for task, result in (yield from _described_now(catalog, tasks)):
-        if isinstance(result, str):
-            raise CatalogError(f"{task.name!r} cannot be described: {result}.", next_step=Do.VERIFY_CATALOG())
-        found[task.seal] = contents_of(task, result)[kind.name]
+    # The descriptors of every enrolled view are computed from one segmentation.
+    together = DESCRIPTORS if kind.name in DESCRIPTORS and not kind.whole_image else (kind.name,)
+    with catalog.database.read() as transaction:
+        wanted = state.used(transaction, checked=True)
+        found = stored_contents(transaction, [one.seal for one in wanted], (kind.name,))[kind.name]
+        missing = []
+        for one in wanted:
+            if one.seal not in found:
+                (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
+                missing.append((one.name, known.enrollment))
+    if missing:
+        yield JobProgress(0, len(missing))
+    count = sum(len(enrollment.views) for _, enrollment in missing)
+    work = partial(describe_one, catalog.database.images, together)
+    failed = ""
+    for done, ((name, enrollment), contents) in enumerate(map_in_processes(work, missing, processes(None, count)), 1):
+        if isinstance(contents, str):
+            failed = failed or f"{name!r} cannot be described: {contents}."
+        else:
+            seal = seal_of(enrollment)
+            store(catalog.database, seal, contents)
+            found[seal] = contents[kind.name]
+        yield JobProgress(done, len(missing))
+    if failed:
+        raise CatalogError(failed, next_step=Do.VERIFY_CATALOG())
     if not wanted:
         return hbr.Views.empty(kind.name)
-    contents = [found[one.seal] for one in wanted]
-    records = records_of(kind, b"".join(contents))
+    in_order = [found[one.seal] for one in wanted]
+    records = records_of(kind, b"".join(in_order))
     azimuth_deg = np.ascontiguousarray(records["azimuth_deg"])
     if not ((azimuth_deg >= 0) & (azimuth_deg < 360)).all():
         raise damaged("an azimuth of a stored description", azimuth_deg.min())
     return hbr.PackedViews(
         records["packed"],
         azimuth_deg,
-        np.repeat(np.arange(len(wanted)), [len(content) // records.itemsize for content in contents]),
+        np.repeat(np.arange(len(wanted)), [len(content) // records.itemsize for content in in_order]),
         tuple(one.name for one in wanted),
         kind.name,
     )
@@ -133,7 +105,7 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     enrollment = found.complete
     if enrollment is None:
         return []
-    evidence = described(catalog, enrollment, name, BENCH_DESCRIPTOR).segmentation
+    evidence = described(catalog.database, enrollment, name, BENCH_DESCRIPTOR).segmentation
     describers: dict[tuple[Region | None, str | None], ViewDescriber] = {}
     cut_out = []
     for place in near([view.azimuth_deg for view in enrollment.views], azimuths_deg):
@@ -169,38 +141,3 @@ def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, 
             if enrollment_id in ids:
                 found.add((region, tuple(map(str, conditions.get(CALIBRATIONS) or ()))))
     return found
-
-
-# Describe
-
-
-def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list[state.Used], list[Task]]:
-    """Return the enrollments in use, and those to be described; put the stored levels of the others into ``found``."""
-    # The descriptors of every enrolled view are computed from one segmentation.
-    compute = DESCRIPTORS if name in DESCRIPTORS and not descriptor(name).whole_image else (name,)
-    with catalog.database.read() as transaction:
-        wanted = state.used(transaction, checked=True)
-        found.update(stored_contents(transaction, [one.seal for one in wanted], (name,))[name])
-        missing = [one for one in wanted if one.seal not in found]
-        tasks = []
-        for one in missing:
-            (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
-            tasks.append(task_of(known.enrollment, one.seal, one.name, compute))
-    return wanted, tasks
-
-
-def _described_now(
-    catalog: Catalog, tasks: Sequence[Task]
-) -> Generator[JobProgress, None, list[tuple[Task, Described | str]]]:
-    """Describe enrollments in processes and store the results; a text is the reason why one cannot be described."""
-    done: list[tuple[Task, Described | str]] = []
-    if tasks:
-        yield JobProgress(0, len(tasks))
-    work = partial(describe_task, catalog.database.images)
-    count = sum(len(task.views) for task in tasks)
-    for task, result in map_in_processes(work, tasks, processes(None, count)):
-        if not isinstance(result, str):
-            store(catalog.database, [(task, result)])
-        done.append((task, result))
-        yield JobProgress(len(done), len(tasks))
-    return done

@@ -5,13 +5,11 @@ Decision: docs/decisions/0010.
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
-from itertools import groupby
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +23,6 @@ from rig.catalog.database import Database
 from rig.catalog.facts import Derived, Enrollment, seal_of
 from rig.catalog.images import Images
 from rig.catalog.opening import open_database
-from rig.catalog.records import Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, ExtraMissing, RigError, UsageError
 from rig.core.files import json_values
@@ -38,42 +35,18 @@ SEGMENTATION_VERSION: Final = 2
 """Increases when the same images give other silhouettes."""
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
-
 MOST_HELD_BYTES: Final = 256_000_000
 """Pixels of one enrollment that are held in memory until it is described: 277 views of 640x480."""
 
-Levels = NDArray[np.uint8]
-
-
-class _DescribedImage(NamedTuple):
-    """The image of a view, its session, and the part of it that is described."""
-
-    image: str
-    session: int
-    region: Region | None
-    azimuth_deg: float
-
-
-class Task(NamedTuple):
-    """An enrollment to be described: by these descriptors, with the empty-table images (a sheet) of each session."""
-
-    seal: str
-    name: str
-    names: tuple[str, ...]
-    views: tuple[_DescribedImage, ...]
-    empty_tables: tuple[str | None, ...]
+Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Described:
     """The levels of the views of an enrollment by each descriptor, uint8 (n, length), and their segmentation."""
 
-    levels: Mapping[str, Levels]
+    levels: Mapping[str, NDArray[np.uint8]]
     segmentation: tuple[dict[str, Any], ...]
-
-
-class _Pixels(Protocol):
-    def __call__(self, image: str, /) -> NDArray[np.uint8]: ...
 
 
 def known_descriptor(name: str) -> Descriptor:
@@ -94,37 +67,50 @@ def known_descriptor(name: str) -> Descriptor:
     return kind
 
 
-def describe_new(database: Database, enrollment: Enrollment, held: Mapping[str, NDArray[np.uint8]], name: str) -> str:
-    """Describe an enrollment that is about to be complete, store the result, and return its seal.
+def described(
+    database: Database,
+    enrollment: Enrollment,
+    name: str,
+    *wanted: str,
+    held: Mapping[str, Pixels] | None = None,
+) -> Described:
+    """Return the stored description of an enrollment of the object ``name``, or compute and store it.
 
-    ``held`` are pixels of images that need not be read again.
+    It is by `DESCRIPTORS`, or by those that are ``wanted``. ``held`` are pixels of images that need not be read again.
 
     Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
     """
-    images = database.images
+    kinds = wanted or DESCRIPTORS
     seal = seal_of(enrollment)
-    task = task_of(enrollment, seal, name, DESCRIPTORS)
-
+    needed = kinds if all(descriptor(kind).whole_image for kind in kinds) else (SEGMENTATION, *kinds)
+    with database.read() as transaction:
+        stored = {kind: found.get(seal, b"") for kind, found in stored_contents(transaction, [seal], needed).items()}
+    if all(stored.values()):
+        packed = {kind: records_of(descriptor(kind), stored[kind])["packed"].tobytes() for kind in kinds}
+        levels = {kind: descriptor(kind).unpack_rows(content) for kind, content in packed.items()}
+        count = len(enrollment.views)
+        # What this program has not made is computed again.
+        with suppress(ValueError, TypeError, AttributeError, RigError):
+            return Described(
+                levels, _evidence(stored[SEGMENTATION], count) if SEGMENTATION in needed else ({},) * count
+            )
     with database.catalog_errors():
-        found = describe(held_pixels(images, held), task, threads=THREADS)
-    store(database, [(task, found)])
-    return seal
+        found = _describe(_reader(database.images, held), enrollment, name, kinds, threads=THREADS)
+    store(database, seal, _contents(enrollment, found))
+    return found
 
 
-def task_of(enrollment: Enrollment, seal: str, name: str, names: tuple[str, ...]) -> Task:
-    """Return the task to describe an enrollment."""
-    views = tuple(_DescribedImage(view.image, view.session, view.region, view.azimuth_deg) for view in enrollment.views)
-    return Task(seal, name, names, views, tuple(session.empty_table for session in enrollment.sessions))
+# Compute
 
 
-def held_pixels(images: Images, held: Mapping[str, NDArray[np.uint8]] | None = None) -> _Pixels:
+def _reader(images: Images, held: Mapping[str, Pixels] | None = None) -> Callable[[str], Pixels]:
     """Return a function that reads each image once: it holds pixels, ``held`` ones first, up to `MOST_HELD_BYTES`.
 
     Decoding takes longer than describing, and a view is used several times.
     """
     known = dict(held or {})
 
-    def pixels(image: str) -> NDArray[np.uint8]:
+    def pixels(image: str) -> Pixels:
         if image in known:
             return known[image]
         found = images.pixels(image)
@@ -135,125 +121,116 @@ def held_pixels(images: Images, held: Mapping[str, NDArray[np.uint8]] | None = N
     return pixels
 
 
-def describe_task(images: Images, task: Task) -> Described | str:
-    """Describe an enrollment in a worker process; a text says why it cannot be described."""
+def describe_one(images: Images, kinds: tuple[str, ...], one: tuple[str, Enrollment]) -> dict[str, bytes] | str:
+    """Return the contents of the description of an object's enrollment, by kind, or why it cannot be described.
+
+    Runs in a worker process.
+    """
+    name, enrollment = one
     try:
-        return describe(held_pixels(images), task)
+        return _contents(enrollment, _describe(_reader(images), enrollment, name, kinds))
     except (CatalogError, UsageError) as error:
         return error.what.rstrip(".")
 
 
-def describe(pixels: _Pixels, task: Task, *, threads: int = 1) -> Described:
-    """Segment the views of an enrollment together and describe them.
+def _describe(
+    pixels: Callable[[str], Pixels], enrollment: Enrollment, name: str, kinds: tuple[str, ...], *, threads: int = 1
+) -> Described:
+    views, none = enrollment.views, np.empty(0, np.uint8)
+    levels = {kind: [none] * len(views) for kind in kinds}
+    evidence: list[dict[str, Any]] = [{}] * len(views)
+    # Descriptors of the whole image need no other view. The others describe what the segmentation cuts out.
+    whole = [kind for kind in kinds if descriptor(kind).whole_image]
+    cut_out = tuple(sorted(set(kinds).difference(whole)))
+    learned = _learned(pixels, enrollment, name, cut_out) if cut_out else {}
 
-    Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
-    """
-    count = len(task.views)
-    levels: dict[str, list[Levels]] = {name: [np.empty(0, np.uint8)] * count for name in task.names}
-    evidence: list[dict[str, Any]] = [{}] * count
-    alone = [name for name in task.names if not descriptor(name).whole_image]
+    def describe_view(place: int) -> None:
+        view = views[place]
+        with _reasons(name, place):
+            image = pixels(view.image)
+            part = within(image, view.region)
+            for kind in whole:
+                levels[kind][place] = descriptor(kind).describe(part)
+            if cut_out:
+                describer, number = learned[place]
+                found = describer.describe(number, image, view.azimuth_deg)
+                for kind in cut_out:
+                    levels[kind][place] = found.levels[kind]
+                evidence[place] = found.segmentation or {}
 
-    def whole(place: int) -> None:
-        view = task.views[place]
-        part = within(pixels(view.image), view.region)
-        for name in task.names:
-            if name not in alone:
-                levels[name][place] = descriptor(name).describe(part)
-
-    def together(place: int, describer: EnrollmentDescriber, number: int) -> None:
-        view = task.views[place]
-        found = describer.describe(number, pixels(view.image), view.azimuth_deg)
-        for name in alone:
-            levels[name][place] = found.levels[name]
-        evidence[place] = found.segmentation or {}
-
-    # Descriptors of the whole image need no other view.
-    steps: list[tuple[int, Callable[[], None]]] = []
-    if len(alone) < len(task.names):
-        steps += [(place, partial(whole, place)) for place in range(count)]
-    # The background is learned from the views of one session; from all of the region if it has too few.
-    for session, places in (
-        groupby(sorted(range(count), key=partial(_group, task)), partial(_group, task)) if alone else ()
-    ):
-        own = list(places)
-        region = task.views[own[0]].region
-        same_region = [place for place in range(count) if task.views[place].region == region]
-        learned_from = own if len(own) >= FEWEST_VIEWS else same_region
-        table = task.empty_tables[session[0]]
-        describer = EnrollmentDescriber(
-            ViewConfig(roi=region), tuple(sorted(alone)), None if table is None else pixels(table)
-        )
-        numbers = {}
-        for place in learned_from:
-            with _reasons(task, place):
-                numbers[place] = describer.learn(pixels(task.views[place].image))
-        steps += [(place, partial(together, place, describer, numbers[place])) for place in own]
-
-    def run(step: tuple[int, Callable[[], None]]) -> None:
-        with _reasons(task, step[0]):
-            step[1]()
-
-    # The steps are independent, so their order and the number of threads do not change the result.
+    # The views are independent now, so their order and the number of threads do not change the result.
     if threads == 1:
-        for step in steps:
-            run(step)
+        for place in range(len(views)):
+            describe_view(place)
     else:
         with ThreadPoolExecutor(threads, "describer") as pool:
-            list(pool.map(run, steps))
-    return Described({name: np.stack(rows) for name, rows in levels.items()}, tuple(evidence))
+            list(pool.map(describe_view, range(len(views))))
+    return Described({kind: np.stack(rows) for kind, rows in levels.items()}, tuple(evidence))
 
 
-def _group(task: Task, place: int) -> tuple[int, str]:
-    return task.views[place].session, repr(task.views[place].region)
+def _learned(
+    pixels: Callable[[str], Pixels], enrollment: Enrollment, name: str, kinds: tuple[str, ...]
+) -> dict[int, tuple[EnrollmentDescriber, int]]:
+    """Return the describer that has learned the background of each view, and the number of the view there.
+
+    The background is learned from the views of one session; from all of the region if it has too few.
+    """
+    views = enrollment.views
+    found: dict[int, tuple[EnrollmentDescriber, int]] = {}
+    for number, region in dict.fromkeys((view.session, view.region) for view in views):
+        same_region = [place for place, view in enumerate(views) if view.region == region]
+        own = [place for place in same_region if views[place].session == number]
+        table = enrollment.sessions[number].empty_table
+        describer = EnrollmentDescriber(ViewConfig(roi=region), kinds, None if table is None else pixels(table))
+        numbers = {}
+        for place in own if len(own) >= FEWEST_VIEWS else same_region:
+            with _reasons(name, place):
+                numbers[place] = describer.learn(pixels(views[place].image))
+        found |= {place: (describer, numbers[place]) for place in own}
+    return found
 
 
-class _reasons:  # noqa: N801 - used as a function
+@contextmanager
+def _reasons(name: str, place: int) -> Iterator[None]:
     """Raise errors about a view as a `CatalogError` that names it."""
-
-    def __init__(self, task: Task, place: int) -> None:
-        self._task, self._place = task, place
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, UsageError | ValueError):
-            reason = error.what.rstrip(".") if isinstance(error, UsageError) else str(error)
-            raise CatalogError(
-                f"View {self._place} of {self._task.name!r} cannot be described: {reason}.",
-                next_step=("Check the disk.", Do.VERIFY_CATALOG()),
-            ) from error
+    try:
+        yield
+    except (UsageError, ValueError) as error:
+        reason = error.what.rstrip(".") if isinstance(error, UsageError) else str(error)
+        raise CatalogError(
+            f"View {place} of {name!r} cannot be described: {reason}.",
+            next_step=("Check the disk.", Do.VERIFY_CATALOG()),
+        ) from error
 
 
 # Store
 
 
-def made_by_of(what: str) -> str:
+def _made_by(what: str) -> str:
     version = SEGMENTATION_VERSION if what == SEGMENTATION else descriptor(what).version
-    segmentation = (
-        "" if what != SEGMENTATION and descriptor(what).whole_image else f", segmentation {SEGMENTATION_VERSION}"
-    )
-    return f"{what} {version}{segmentation}"
+    is_cut_out = what != SEGMENTATION and not descriptor(what).whole_image
+    return f"{what} {version}" + (f", segmentation {SEGMENTATION_VERSION}" if is_cut_out else "")
 
 
-def record_of(kind: Descriptor) -> np.dtype[np.void]:
+def _record(kind: Descriptor) -> np.dtype[np.void]:
     return np.dtype([("packed", "u1", (kind.size_bytes,)), ("azimuth_deg", "<f8")])
 
 
 def records_of(kind: Descriptor, content: bytes) -> NDArray[np.void]:
-    return np.frombuffer(content, record_of(kind))
+    """Return the stored records of a descriptor: ``packed`` levels and ``azimuth_deg``."""
+    return np.frombuffer(content, _record(kind))
 
 
 def content_of(kind: Descriptor, packed: NDArray[np.uint8], azimuth_deg: ArrayLike) -> bytes:
     """Return the content of a row of descriptors: their packed levels, uint8 (n, size), with the azimuths (n,)."""
-    records = np.empty(len(packed), record_of(kind))
+    records = np.empty(len(packed), _record(kind))
     records["packed"], records["azimuth_deg"] = packed, azimuth_deg
     return records.tobytes()
 
 
 def row_of(seal: str, what: str, content: bytes) -> dict[str, Any]:
     """Return the columns of a row of `Derived` by this program."""
-    made_by = made_by_of(what)
+    made_by = _made_by(what)
     sha256 = digest_of(seal, what, made_by, content)
     return {"seal": seal, "what": what, "made_by": made_by, "content": content, "sha256": sha256}
 
@@ -265,23 +242,20 @@ def digest_of(seal: str, what: str, made_by: str, content: bytes) -> str:
     return digest.hexdigest()
 
 
-def contents_of(task: Task, found: Described) -> dict[str, bytes]:
-    """Return the contents of a description by their kind."""
+def _contents(enrollment: Enrollment, found: Described) -> dict[str, bytes]:
     contents = {}
     for name, levels in found.levels.items():
         kind = descriptor(name)
         packed = np.frombuffer(b"".join(map(kind.pack, levels)), np.uint8).reshape(len(levels), -1)
-        contents[name] = content_of(kind, packed, [view.azimuth_deg for view in task.views])
+        contents[name] = content_of(kind, packed, [view.azimuth_deg for view in enrollment.views])
     if any(found.segmentation):
         contents[SEGMENTATION] = json.dumps(found.segmentation).encode()
     return contents
 
 
-def store(database: Database, done: Sequence[tuple[Task, Described]]) -> None:
-    """Store descriptions; they are computed again if this fails."""
-    rows = [
-        row_of(task.seal, what, content) for task, found in done for what, content in contents_of(task, found).items()
-    ]
+def store(database: Database, seal: str, contents: Mapping[str, bytes]) -> None:
+    """Store a description by kind; it is computed again if this fails."""
+    rows = [row_of(seal, what, content) for what, content in contents.items()]
     with suppress(RigError):
         if not database.read_only:
             _write(database, rows)
@@ -314,13 +288,13 @@ def stored_contents(
     wanted = set(seals)
     found: dict[str, dict[str, bytes]] = {}
     for what in kinds:
-        made_by = made_by_of(what)
+        made_by = _made_by(what)
         query = select(Derived.seal, Derived.content, Derived.sha256).where(
             Derived.what == what, Derived.made_by == made_by
         )
         if len(wanted) < 100:
             query = query.where(Derived.seal.in_(wanted))
-        size = 1 if what == SEGMENTATION else record_of(descriptor(what)).itemsize
+        size = 1 if what == SEGMENTATION else _record(descriptor(what)).itemsize
         found[what] = {
             seal: content
             for seal, content, sha256 in transaction.execute(query)
@@ -332,7 +306,7 @@ def stored_contents(
     return found
 
 
-def evidence_of(content: bytes, views: int) -> tuple[dict[str, Any], ...]:
+def _evidence(content: bytes, views: int) -> tuple[dict[str, Any], ...]:
     """Return the evidence of each view; an error if there is none that this program would have stored."""
     found = tuple(json_values(content))
     if len(found) != views:
@@ -340,8 +314,3 @@ def evidence_of(content: bytes, views: int) -> tuple[dict[str, Any], ...]:
     for one in found:
         check_evidence(one)
     return found
-
-
-def contents(pixels: _Pixels, task: Task) -> dict[str, bytes]:
-    """Compute what a task would store, by kind; errors as `described`."""
-    return contents_of(task, describe(pixels, task))

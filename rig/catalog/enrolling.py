@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
 from rig.catalog.database import Database
-from rig.catalog.describing import MOST_HELD_BYTES, describe_new
+from rig.catalog.describing import MOST_HELD_BYTES, described
 from rig.catalog.facts import Action, Enrollment, Session, View, digest_of
 from rig.catalog.records import EnrollmentStatus, as_json
 from rig.core.clock import Clock
@@ -119,12 +119,12 @@ class OpenEnrollment:
                 next_step=(Do.CONTINUE_ENROLLMENT(name=self.object_name), "Or abandon it."),
                 evidence={"missing_views": list(missing)},
             )
-        seal = describe_new(database, enrollment, self._held, self.object_name)
+        described(database, enrollment, self.object_name, held=self._held)
         with database.write() as transaction:
             self._check_in_progress(transaction)
             known = state.by_id(transaction, enrollment.object_id)
             state.end_current(transaction, clock, known, EnrollmentStatus.COMPLETE)
-            done = state.EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, clock.utc(), seal)
+            done = state.EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, clock.utc())
             log.append(transaction, clock, Action.ENROLLED, known.object_name, **state.ending(done))
 
     def abandon(self) -> None:

@@ -1,25 +1,23 @@
-"""The images of a transfer: each is read, compared with its name, stored and described, in several processes.
+"""The images of a transfer: each is read, compared with its name, decoded and stored, in several processes.
 
 A file that cannot be used is rejected, with the reason.
 """
 
 import zlib
-from collections.abc import Callable, Generator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, field
 from enum import Enum, unique
 from functools import partial
 from typing import Any, Final
 from zipfile import BadZipFile
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rig.catalog import describing
+from rig.catalog.facts import Enrollment
 from rig.catalog.images import Images, name_of
 from rig.catalog.jobs import JobProgress, processes
-from rig.core.errors import CatalogDamaged, CatalogError, UsageError
+from rig.catalog.records import Region
+from rig.core.errors import CatalogDamaged, UsageError
 from rig.core.processes import map_in_processes
+from rig.views.description import within
 from rig.views.image_files import BadImage, decode
 
 
@@ -72,7 +70,9 @@ _READ_ERRORS: Final = (
     KeyError,
     zlib.error,
 )
-_NO_PIXELS: Final = np.empty((0, 0, 3), np.uint8)  # for images that are stored without being decoded
+
+_Wanted = tuple[tuple[str, Region | None], ...]
+"""The images of an enrollment, each with the part that is described."""
 
 
 @dataclass(frozen=True)
@@ -99,99 +99,63 @@ class Reading:
 
 @dataclass
 class ReadImages:
-    """What was read: name and size in bytes of each image, or the reason why it cannot be used.
-
-    ``contents`` are the descriptions of enrollments by their keys (`describing.contents`).
-    """
+    """What was read: name and size in bytes of each image, or the reason why it cannot be used."""
 
     images: dict[str, tuple[str, int]] = field(default_factory=dict)
     rejected: dict[str, Reason] = field(default_factory=dict)
-    contents: dict[str, dict[str, bytes]] = field(default_factory=dict)
-
-    def add(self, other: "ReadImages") -> None:
-        self.images |= other.images
-        self.rejected |= other.rejected
-        self.contents |= other.contents
 
     @property
     def rejected_files(self) -> tuple[RejectedFile, ...]:
         return tuple(RejectedFile(image, reason) for image, reason in self.rejected.items())
 
 
-class _Rejected(Exception):
-    """An image cannot be used."""
-
-
 def read_images(
-    reading: Reading, tasks: Sequence[describing.Task], *, strict: bool, jobs: int | None
+    reading: Reading, enrollments: Iterable[Enrollment], *, strict: bool, jobs: int | None
 ) -> Generator[JobProgress, None, ReadImages]:
     """Read the images of enrollments; with ``strict`` it ends at the first enrollment with a rejected one."""
-    total, done = sum(len(_names(task)) for task in tasks), 0
+    wanted = [_images(one) for one in enrollments]
+    total, done = sum(map(len, wanted)), 0
     found = ReadImages()
     yield JobProgress(0, total)
-    for task, part in map_in_processes(partial(_read, reading), tasks, processes(jobs, total)):
-        found.add(part)
+    for of_one, part in map_in_processes(partial(_read, reading), wanted, processes(jobs, total)):
+        found.images |= part.images
+        found.rejected |= part.rejected
         if strict and found.rejected:
             break
-        done += len(_names(task))
+        done += len(of_one)
         yield JobProgress(done, total)
     return found
 
 
-def _read(reading: Reading, task: describing.Task) -> ReadImages:
-    """Read the images of an enrollment, and describe those that can be used. Runs in a worker process."""
+def _images(enrollment: Enrollment) -> _Wanted:
+    tables = ((session.empty_table, None) for session in enrollment.sessions if session.empty_table is not None)
+    return tuple(dict.fromkeys((*((view.image, view.region) for view in enrollment.views), *tables)))
+
+
+def _read(reading: Reading, wanted: _Wanted) -> ReadImages:
+    """Read the images of an enrollment. Runs in a worker process."""
     found = ReadImages()
-    last = ""
-
-    def pixels(image: str) -> NDArray[np.uint8]:
-        nonlocal last
-        last = image
-        return _pixels(reading, image, found)
-
-    def read_others() -> None:
-        for image in _names(task):
-            if image not in found.images and image not in found.rejected:
-                with suppress(_Rejected):
-                    pixels(image)
-
-    while task.names and task.views:
+    for image, region in wanted:
+        reason = None
         try:
-            found.contents[task.seal] = describing.contents(pixels, task)
-            break
-        except _Rejected:
-            read_others()
-            if not found.rejected.keys().isdisjoint(task.empty_tables):
-                break
-        except CatalogError as error:
-            if not isinstance(error.__cause__, UsageError | ValueError):
-                raise  # of the store
-            reason = error.__cause__.what.rstrip(".") if isinstance(error.__cause__, UsageError) else error.__cause__
-            found.rejected[last] = Reason(ImportProblem.NOT_DESCRIBED, {"error": str(reason)})
-        task = task._replace(views=tuple(view for view in task.views if view.image not in found.rejected))
-    read_others()
+            content = reading.content(image)
+            name = name_of(content)
+            if reading.is_named and name != image:
+                reason = Reason(ImportProblem.OTHER_IMAGE)
+            elif reading.decodes:
+                within(decode(content), region)
+        except BadImage as error:
+            reason = Reason(ImportProblem.INVALID_IMAGE, {"error": str(error)})
+        except UsageError as error:
+            reason = Reason(ImportProblem.NOT_DESCRIBED, {"error": error.what.rstrip(".")})
+        except (CatalogDamaged, *_READ_ERRORS) as error:  # a link that leads out of a catalog is damage
+            reason = Reason(ImportProblem.UNREADABLE, {"error": str(error)})
+        if reason is not None:
+            found.rejected[image] = reason
+            continue
+        if reading.store is not None and image not in found.images:
+            reading.store.put(content, settled=False)
+        found.images[image] = name, len(content)
+    for image in found.rejected:  # another part of it may lie within it
+        found.images.pop(image, None)
     return found
-
-
-def _pixels(reading: Reading, image: str, found: ReadImages) -> NDArray[np.uint8]:
-    try:
-        content = reading.content(image)
-        name = name_of(content)
-        if reading.is_named and name != image:
-            found.rejected[image] = Reason(ImportProblem.OTHER_IMAGE)
-            raise _Rejected(image)
-        pixels = decode(content) if reading.decodes else _NO_PIXELS
-    except BadImage as error:
-        found.rejected[image] = Reason(ImportProblem.INVALID_IMAGE, {"error": str(error)})
-        raise _Rejected(image) from error
-    except (CatalogDamaged, *_READ_ERRORS) as error:  # a link that leads out of a catalog is damage
-        found.rejected[image] = Reason(ImportProblem.UNREADABLE, {"error": str(error)})
-        raise _Rejected(image) from error
-    if reading.store is not None and image not in found.images:
-        reading.store.put(content, settled=False)
-    found.images[image] = name, len(content)
-    return pixels
-
-
-def _names(task: describing.Task) -> list[str]:
-    """Return the images of an enrollment, each once."""
-    return list(dict.fromkeys([*(view.image for view in task.views), *filter(None, task.empty_tables)]))

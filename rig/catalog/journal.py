@@ -220,7 +220,7 @@ def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) ->
         enrollment = journal.object(name).complete
         assert enrollment is not None
         conflict = Conflict.REPLACE if replaces or _replaces(journal, enrollment) else Conflict.REJECT
-        finished(transfer(CatalogSource(journal, [name], used_only=True), server, conflict=conflict, once=True, jobs=1))
+        finished(transfer(CatalogSource(journal, [name]), server, conflict=conflict, once=True, jobs=1))
     except ObjectExists:
         return ObjectExists(
             f"The journal has {name!r}, and the catalog has another object of that name. Nothing is lost.",

@@ -86,7 +86,7 @@ class EnrollmentState:
     enrollment: Enrollment
     status: EnrollmentStatus
     finished_utc: datetime | None
-    seal: str | None
+    seal: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -426,15 +426,10 @@ def ending(one: EnrollmentState) -> dict[str, Any]:
     }
 
 
-def end_current(
-    transaction: Transaction, clock: Clock, known: Entry, status: EnrollmentStatus, *, kept: Collection[str] = ()
-) -> None:
-    """End the enrollment of an object that is complete or in progress, if there is one: another one replaces it.
-
-    ``kept`` are the keys of enrollments that are not ended.
-    """
+def end_current(transaction: Transaction, clock: Clock, known: Entry, status: EnrollmentStatus) -> None:
+    """End the enrollment of an object that is complete or in progress, if there is one: another one replaces it."""
     before = of_status(transaction, known, status)
-    if before is not None and before.enrollment.key not in kept:
+    if before is not None:
         ended, action = CURRENT[status]
         one = replace(before, status=ended, finished_utc=before.finished_utc or clock.utc())
         log.append(transaction, clock, action, known.object_name, **ending(one))

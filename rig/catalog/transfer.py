@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Protocol
 
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session as Transaction
@@ -23,7 +23,6 @@ from rig.catalog.facts import (
     Action,
     Derived,
     Enrollment,
-    Entry,
     Session,
     View,
     digest_of,
@@ -34,8 +33,8 @@ from rig.catalog.facts import (
 from rig.catalog.incoming import ImportProblem, ReadImages, Reading, Reason, RejectedFile, read_images
 from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
-from rig.catalog.state import Ended, EnrollmentState, Named
-from rig.core.errors import CatalogDamaged, ImportRejected, ObjectExists, RigError, UsageError
+from rig.catalog.state import EnrollmentState, Named
+from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 
 _OF_SESSION: Final = ("number", "started_utc", "provenance", "empty_table", "empty_table_bytes")
@@ -53,17 +52,14 @@ class Conflict(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TransferItem:
-    """An object with its enrollments, oldest first."""
+    """An object with the enrollment that searches use."""
 
     name: str
     label: str
     note: str
     created_utc: datetime
-    enrollments: tuple[EnrollmentState, ...]
-
-    @property
-    def keys(self) -> set[str]:
-        return {one.enrollment.key for one in self.enrollments}
+    enrollment: Enrollment
+    finished_utc: datetime | None
 
 
 class TransferSource(Protocol):
@@ -88,18 +84,15 @@ class TransferSource(Protocol):
 class CatalogSource:
     """The objects in use of a catalog.
 
-    These ``names``, or all; with ``used_only`` only the enrollments that searches use. If the catalog is this bench's
-    ``own``, its images are compared with their names, but are not decoded again.
+    These ``names``, or all. If the catalog is this bench's ``own``, its images are compared with their names, but are
+    not decoded again.
     """
 
     rejected: Sequence[RejectedFile] = ()
 
-    def __init__(
-        self, catalog: Catalog, names: Sequence[str] = (), *, used_only: bool = False, own: bool = True
-    ) -> None:
+    def __init__(self, catalog: Catalog, names: Sequence[str] = (), *, own: bool = True) -> None:
         self.catalog = catalog
         self.names = names
-        self.used_only = used_only
         self.own = own
         self.origin = str(catalog.place)
         self.content: Callable[[str], bytes] = catalog.database.images.read
@@ -107,48 +100,46 @@ class CatalogSource:
     def items(self) -> Iterator[TransferItem]:
         """Yield the objects in the order in which they were added.
 
-        Raises `ObjectNotFound`: there is no object of one of the names.
+        Raises `ObjectNotFound`: there is no object of one of the names. `CatalogError`: its enrollment is unfinished.
         """
         with self.catalog.database.read() as transaction:
-            state.used(transaction, checked=True)
-            if not self.used_only:
-                state.check_present(transaction)
+            used = state.used(transaction, checked=True)
             if self.names:
-                by_id = {one.id: one for one in (state.find(transaction, name) for name in self.names)}
-                wanted: Sequence[Entry] = sorted(by_id.values(), key=lambda one: one.object_id or 0)
-            else:
-                wanted = transaction.scalars(select(Named).where(state.IN_USE).order_by(Named.object_id)).all()
-            transaction.expunge_all()
-            used: set[str] = set()
-            for known in wanted:
-                conditions = [state.of_object(known.object_id)]
-                conditions += [Ended.status == EnrollmentStatus.COMPLETE] if self.used_only else []
-                found = state.enrollments(transaction, *conditions)
+                named = [state.find(transaction, name) for name in dict.fromkeys(self.names)]
+                enrolled = {one.object_id for one in used}
+                for known in named:
+                    if known.object_id not in enrolled:
+                        raise _unfinished(str(known.object_name))
+                used = [one for one in used if one.object_id in {known.object_id for known in named}]
+            names: set[str] = set()
+            for one in used:
+                known = state.by_id(transaction, one.object_id)
+                (found,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
                 item = TransferItem(
                     *(str(known.object_name), known.label or "", known.note or "", known.created_utc or known.time_utc),
-                    tuple(reversed(found)),
+                    *(found.enrollment, found.finished_utc),
                 )
                 _check(item)
-                if item.name in used:
+                if item.name in names:
                     raise damaged("the name of two objects", item.name)
-                used.add(item.name)
-                if found or not self.used_only:
-                    yield item
+                names.add(item.name)
+                yield item
+
+
+def _unfinished(name: str) -> CatalogError:
+    return CatalogError(f"The enrollment of {name!r} is unfinished.", next_step=Do.CONTINUE_ENROLLMENT(name=name))
 
 
 def _check(item: TransferItem) -> None:
     """Raise `CatalogDamaged` if this program would not have stored an object. Its digests are those of its rows."""
-    sessions = [session.provenance for one in item.enrollments for session in one.enrollment.sessions]
+    by = [session.provenance for session in item.enrollment.sessions]
     try:
         if clean_name(item.name) != item.name:
             raise damaged("the name of an object", item.name)
-        for text in (item.label, item.note, *(text for by in sessions for text in (by.bench, by.software))):
+        for text in (item.label, item.note, *(text for one in by for text in (one.bench, one.software))):
             check_text(text, "text")
     except UsageError as error:
         raise damaged(error.what.rstrip("."), item.name) from error
-    current = [one.status for one in item.enrollments if one.status in state.CURRENT]
-    if len(set(current)) < len(current):
-        raise damaged(f"the number of enrollments of {item.name!r} that are {current[0]}", len(current))
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,22 +160,20 @@ def transfer(
     *,
     conflict: Conflict = Conflict.REJECT,
     label: str | None = None,
-    descriptors: Sequence[str] = (),
     jobs: int | None = None,
     dry_run: bool = False,
     once: bool = False,
 ) -> Generator[JobProgress, None, Transferred]:
     """Transfer objects into a catalog, all or nothing; it yields its progress in images.
 
-    An enrollment has a key. If the target has it already, with the same views, it is not added a second time. Of
-    photographs, those that cannot be used are left out; of a catalog, nothing is transferred if one image is wrong.
+    Each object comes with the enrollment that searches use. If the target has it already, by its key, it is not added
+    a second time. Of photographs, those that cannot be used are left out; of a catalog, nothing is transferred if one
+    image is wrong.
 
     Parameters
     ----------
     label
         Label of new objects that have none.
-    descriptors
-        Descriptors to be computed at once; others are computed when they are needed.
     jobs
         Number of processes; None for one process per core.
     dry_run
@@ -193,13 +182,11 @@ def transfer(
         An enrollment is delivered: it stays as the target has it, even if it was deleted or replaced there. What was
         computed from it goes with it.
 
-    Raises `UsageError`: there is no such descriptor, or the label cannot be stored. `ImportRejected`: nothing is left
+    Raises `UsageError`: the label cannot be stored. `ImportRejected`: nothing is left
     to transfer, or an image of a catalog was rejected. `ObjectExists`: some objects are in the catalog already, and
     conflicts are rejected.
     """
     checked_texts(label, None)
-    for name in descriptors:
-        describing.known_descriptor(name)
     catalog = source if isinstance(source, CatalogSource) else None
     is_own = catalog is not None and catalog.own
     strict = catalog is not None
@@ -209,23 +196,18 @@ def transfer(
     plan = _Plan(tuple(source.items()))
     with target.database.read() as transaction:
         plan = plan.compared(transaction, conflict, once=once)
-    names = tuple(dict.fromkeys(descriptors))
-    tasks = [
-        describing.task_of(one.enrollment, one.enrollment.key, item.name, names)
-        for item in plan.wanted
-        for one in item.enrollments
-    ]
+    enrollments = [item.enrollment for item in plan.wanted]
     reading = Reading(
         source.content,
         store if is_own or not strict else None,
         is_named=catalog is not None,
-        decodes=bool(names) or not is_own,
+        decodes=not is_own,
     )
     with target.database.catalog_errors():
-        found = yield from read_images(reading, tasks, strict=strict and not dry_run, jobs=jobs)
+        found = yield from read_images(reading, enrollments, strict=strict and not dry_run, jobs=jobs)
     rejected = (*source.rejected, *found.rejected_files)
     plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=catalog is None))
-    tables = {image for task in tasks for image in task.empty_tables}
+    tables = {session.empty_table for one in enrollments for session in one.sessions}
     if (strict and rejected) or (found.rejected and not plan.wanted) or not tables.isdisjoint(found.rejected):
         raise _rejection(source, rejected)
 
@@ -234,9 +216,7 @@ def transfer(
         with target.database.catalog_errors():
             if reading.store is None:
                 storing = replace(reading, store=store, decodes=False)
-                again = yield from read_images(
-                    storing, [task._replace(names=()) for task in tasks], strict=True, jobs=jobs
-                )
+                again = yield from read_images(storing, enrollments, strict=True, jobs=jobs)
                 if again.rejected:  # the source has just been changed
                     raise _rejection(source, again.rejected_files)
             store.settle({name for name, _ in found.images.values()})
@@ -253,7 +233,8 @@ def transfer(
                 log.append(
                     transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)}
                 )
-                describing.add(transaction, _computed(source, new, found.contents, copied=once))
+                if once and catalog is not None:
+                    describing.add(transaction, _computed(catalog.catalog, new))
     counts = (len(plan.wanted), plan.views, plan.bytes)
     return Transferred(*counts, plan.skipped, plan.replaced, rejected)
 
@@ -275,16 +256,11 @@ def _rejection(source: TransferSource, rejected: Sequence[RejectedFile]) -> RigE
 
 def _kept(items: Sequence[TransferItem], found: ReadImages, *, are_photographs: bool) -> tuple[TransferItem, ...]:
     """Return new rows of objects with the stored images, without the views whose images were rejected."""
-    kept = []
-    for item in items:
-        new = [
-            replace(one, enrollment=_new(item.name, one.enrollment, found, is_photographed=are_photographs))
-            for one in item.enrollments
-            if not one.enrollment.views or any(view.image in found.images for view in one.enrollment.views)
-        ]
-        if new or not item.enrollments:
-            kept.append(replace(item, enrollments=tuple(new)))
-    return tuple(kept)
+    return tuple(
+        replace(item, enrollment=_new(item.name, item.enrollment, found, is_photographed=are_photographs))
+        for item in items
+        if any(view.image in found.images for view in item.enrollment.views)
+    )
 
 
 def _new(name: str, old: Enrollment, found: ReadImages, *, is_photographed: bool) -> Enrollment:
@@ -296,7 +272,6 @@ def _new(name: str, old: Enrollment, found: ReadImages, *, is_photographed: bool
         tables = [found.images.get(session.empty_table or "") for session in old.sessions]
         shown = [(view.azimuth_deg, found.images[view.image], view.region) for view in good]
         key = sha256_of((name, *shown, *([tables] if any(tables) else [])))
-        found.contents[key] = found.contents.pop(old.key, {})
     new = Enrollment(key=key, object_id=0, started_utc=old.started_utc, planned_azimuth_deg=plan)
     for session in old.sessions:
         part = Session(**{name: getattr(session, name) for name in _OF_SESSION})
@@ -323,14 +298,6 @@ def _digest(enrollment: Enrollment, key: str) -> None:
 # What the target has already
 
 
-class _Known(NamedTuple):
-    """An enrollment that the target has, of the object with this id."""
-
-    state: EnrollmentState
-    object_id: int
-    in_use: bool
-
-
 @dataclass(frozen=True, slots=True)
 class _Plan:
     """The objects to add, and the names of those that are left out and that get new enrollments.
@@ -341,7 +308,7 @@ class _Plan:
     wanted: tuple[TransferItem, ...]
     skipped: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
-    known: Mapping[str, _Known] = field(default_factory=dict)
+    known: Mapping[str, EnrollmentState] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -349,21 +316,36 @@ class _Plan:
 
     @property
     def views(self) -> int:
-        return sum(len(one.enrollment.views) for item in self.wanted for one in item.enrollments)
+        return sum(len(item.enrollment.views) for item in self.wanted)
 
     @property
     def bytes(self) -> int:
         """Sizes of all images, each once."""
-        enrollments = [one.enrollment for item in self.wanted for one in item.enrollments]
+        enrollments = [item.enrollment for item in self.wanted]
         sizes: dict[str | None, int] = {view.image: view.image_bytes for one in enrollments for view in one.views}
         sizes |= {part.empty_table: part.empty_table_bytes or 0 for one in enrollments for part in one.sessions}
         return sum(sizes.values())
 
     def compared(self, transaction: Transaction, conflict: Conflict, *, once: bool) -> "_Plan":
         """Return the plan after a comparison with the target. `ObjectExists` if a conflict is rejected."""
-        known = _known(transaction, [key for item in self.wanted for key in item.keys])
+        known = {
+            one.enrollment.key: one
+            for part in portions([item.enrollment.key for item in self.wanted], digests.AT_ONCE)
+            for one in state.enrollments(transaction, Enrollment.key.in_(part))
+        }
         ids = _ids(transaction, self.names)
-        wanted = [item for item in self.wanted if not _is_there(item, ids.get(item.name), known, once=once)]
+        used = set(transaction.scalars(select(Named.object_id).where(state.IN_USE)))
+
+        def is_there(item: TransferItem) -> bool:
+            """Return whether the target has the enrollment, and an object of this name has it in use."""
+            there = known.get(item.enrollment.key)
+            if there is None or once:
+                return there is not None
+            owner, own = there.enrollment.object_id, ids.get(item.name)
+            is_used = own is None or (owner == own and there.status is EnrollmentStatus.COMPLETE)
+            return owner in used and is_used and seal_of(there.enrollment) == seal_of(item.enrollment)
+
+        wanted = [item for item in self.wanted if not is_there(item)]
         both = [item.name for item in wanted if item.name in ids]
         if both and conflict is Conflict.REJECT:
             raise ObjectExists(
@@ -383,16 +365,6 @@ class _Plan:
         return _Plan(tuple(left), skipped, tuple(both) if conflict is Conflict.REPLACE else (), known)
 
 
-def _known(transaction: Transaction, keys: Sequence[str]) -> dict[str, _Known]:
-    used = set(transaction.scalars(select(Named.object_id).where(state.IN_USE)))
-    found = {}
-    for part in portions(keys, digests.AT_ONCE):
-        for one in state.enrollments(transaction, Enrollment.key.in_(part)):
-            owner = one.enrollment.object_id
-            found[one.enrollment.key] = _Known(one, owner, owner in used)
-    return found
-
-
 def _ids(transaction: Transaction, names: Sequence[str]) -> dict[str, int]:
     """Return the ids of the objects in use with these names."""
     found: dict[str, int] = {}
@@ -405,69 +377,35 @@ def _ids(transaction: Transaction, names: Sequence[str]) -> dict[str, int]:
     return found
 
 
-def _is_there(item: TransferItem, object_id: int | None, known: Mapping[str, _Known], *, once: bool) -> bool:
-    """Return whether the target has the enrollments of an object, and an object of its name has them in use alike."""
-    if not item.enrollments or not item.keys <= known.keys():
-        return False
-    if once:
-        return True
-    for one in item.enrollments:
-        there = known[one.enrollment.key]
-        if not there.in_use or not _are_equal(there.state, one):
-            return False
-        if object_id is not None and (there.object_id, there.state.status) != (object_id, one.status):
-            return False
-    return True
-
-
 # Add
 
 
-def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
-    """Add the rows of objects, and a line of the log for each enrollment; return the new ones by their earlier keys."""
-    new: dict[str, Enrollment] = {}
+def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | None) -> list[Enrollment]:
+    """Add the rows of objects, and a line of the log for each enrollment; return the new ones."""
+    new = []
     for item in plan.wanted:
-        found = state.state_of(transaction, item.name)
-        object_id = log.head(transaction)[0] + 1 if found is None else found.object_id
+        known = state.state_of(transaction, item.name)
+        object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
         assert object_id is not None
-        texts = {"label": item.label or label or "", "note": item.note}
-        columns = {}
-        if found is None:
-            columns = {**state.columns(None, item.created_utc, texts), "object_id": object_id}
-        there = {
-            key: known.state
-            for one in item.enrollments
-            if (known := plan.known.get(key := one.enrollment.key)) is not None
-            and known.object_id == object_id
-            and _are_equal(known.state, one)
-        }
-        # End what the new enrollments replace.
-        for status in state.CURRENT.keys() & {one.status for one in item.enrollments}:
-            if found is not None:
-                state.end_current(transaction, target.clock, found, status, kept=there)
-        # Add them, or bring those that the object has already into use again.
-        for one in item.enrollments:
-            key = one.enrollment.key
-            if key not in there:
-                if key in plan.known:  # with other views, or of an object that is deleted or has another name
-                    _digest(one.enrollment, secrets.token_hex(32))
-                new[key] = _store(transaction, one.enrollment, object_id)
-            elif there[key].status == one.status:
-                continue
-            else:
-                one = replace(one, enrollment=there[key].enrollment)
-            line = {**columns, **state.ending(one)}
-            log.append(transaction, target.clock, Action.IMPORTED, item.name, **line)
-            columns = {}
-        if columns:
-            log.append(transaction, target.clock, Action.IMPORTED, item.name, **columns)
+        enrollment, there = item.enrollment, plan.known.get(item.enrollment.key)
+        if (
+            there is not None
+            and there.enrollment.object_id == object_id
+            and seal_of(there.enrollment) == seal_of(enrollment)
+        ):
+            enrollment = there.enrollment  # an earlier one of the object: it comes into use again
+        else:
+            if there is not None:  # with other views, or of an object that is deleted or has another name
+                _digest(enrollment, secrets.token_hex(32))
+            new.append(_store(transaction, enrollment, object_id))
+        if known is not None:
+            state.end_current(transaction, target.clock, known, EnrollmentStatus.COMPLETE)
+        columns = state.ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
+        if known is None:
+            texts = {"label": item.label or label or "", "note": item.note}
+            columns |= state.columns(None, item.created_utc, texts)
+        log.append(transaction, target.clock, Action.IMPORTED, item.name, **columns)
     return new
-
-
-def _are_equal(one: EnrollmentState, other: EnrollmentState) -> bool:
-    """Return whether two enrollments with one key have the same views: one of them may have been continued."""
-    digests = [[view.digest for view in each.enrollment.views] for each in (one, other)]
-    return digests[0] == digests[1]
 
 
 def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> Enrollment:
@@ -484,18 +422,11 @@ def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> 
     return enrollment
 
 
-def _computed(
-    source: TransferSource, new: Mapping[str, Enrollment], contents: Mapping[str, Mapping[str, bytes]], *, copied: bool
-) -> list[dict[str, Any]]:
-    """Return the rows of what was computed from new enrollments, here or by their catalog."""
-    rows = [
-        describing.row_of(seal_of(enrollment), what, content)
-        for key, enrollment in new.items()
-        for what, content in contents.get(key, {}).items()
-    ]
-    if copied and isinstance(source, CatalogSource):
-        with source.catalog.database.read() as reading:
-            for part in portions([seal_of(enrollment) for enrollment in new.values()], digests.AT_ONCE):
-                found = reading.execute(select(Derived.__table__).where(Derived.seal.in_(part)))
-                rows += map(dict, found.mappings())
+def _computed(source: Catalog, new: Sequence[Enrollment]) -> list[dict[str, Any]]:
+    """Return the rows of what the catalog ``source`` has computed from these enrollments."""
+    rows: list[dict[str, Any]] = []
+    with source.database.read() as reading:
+        for part in portions(map(seal_of, new), digests.AT_ONCE):
+            found = reading.execute(select(Derived.__table__).where(Derived.seal.in_(part)))
+            rows += map(dict, found.mappings())
     return rows

@@ -18,11 +18,12 @@ from tempfile import TemporaryDirectory
 from typing import Final
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 
+from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.exchange.new_files import new_file
-from rig.catalog.facts import Session, View
+from rig.catalog.facts import Enrollment, Session, View
 from rig.catalog.images import FolderImages, name_of, path_of
 from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
@@ -43,7 +44,7 @@ _DATE: Final = (1980, 1, 1, 0, 0, 0)  # ZIP's earliest: the same objects give th
 
 
 def write_bundle(path: Path, source: CatalogSource) -> int:
-    """Write objects with all their enrollments into a new file, all or nothing, and return their number.
+    """Write objects into a new file, all or nothing, and return their number.
 
     Raises `ExportFailed`: the file exists already or cannot be written.
     """
@@ -109,7 +110,7 @@ def read_bundle(path: Path, clock: Clock) -> Iterator[CatalogSource]:
             catalog = Catalog.open(folder, clock=clock, create=False, read_only=True)
         with catalog:
             with _rejecting(path, folder):
-                _check_images(path, catalog, {name: info.file_size for name, info in members.items()})
+                _check_content(path, catalog, {name: info.file_size for name, info in members.items()})
             yield _Bundled(path, folder, catalog)
 
 
@@ -213,9 +214,11 @@ def _suspicious(info: ZipInfo) -> str:
     return ""
 
 
-def _check_images(path: Path, catalog: Catalog, sizes: Mapping[str, int]) -> None:
-    """Check that exactly the images of the database are in the bundle, with the sizes that they were stored with."""
+def _check_content(path: Path, catalog: Catalog, sizes: Mapping[str, int]) -> None:
+    """Check that every enrollment is in use, and that exactly its images are in the bundle, with their stored sizes."""
     with catalog.database.read() as transaction:
+        if transaction.scalar(select(func.count(Enrollment.id))) != len(state.used(transaction)):
+            raise _rejected(path, "it contains an enrollment that is not complete or not in use")
         tables = select(Session.empty_table, Session.empty_table_bytes).where(Session.empty_table.is_not(None))
         named = {
             str(name): size

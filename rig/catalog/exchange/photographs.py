@@ -18,8 +18,7 @@ from hbr.core.angles import wrap360
 from rig.catalog.exchange.tables import ANGLES, TABLE, parse_region
 from rig.catalog.facts import Enrollment, Session, View
 from rig.catalog.incoming import ImportProblem, Reason, RejectedFile
-from rig.catalog.records import EnrollmentStatus, Provenance, check_text, clean_name, this_software
-from rig.catalog.state import EnrollmentState
+from rig.catalog.records import Provenance, check_text, clean_name, this_software
 from rig.catalog.transfer import TransferItem
 from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do, NextStep
@@ -192,8 +191,7 @@ class Photographs:
                 enrollment.views.append(view)
                 texts = {key: text or row.get(key, "") for key, text in texts.items()}
             enrollment.sessions.extend(sessions.values())
-            state = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, self.now, None)
-            yield TransferItem(name=name, **texts, created_utc=self.now, enrollments=(state,))
+            yield TransferItem(name, **texts, created_utc=self.now, enrollment=enrollment, finished_utc=self.now)
 
 
 def read_photographs(

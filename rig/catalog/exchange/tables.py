@@ -12,16 +12,16 @@ from enum import StrEnum
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from hbr.descriptors import descriptor
-from rig.catalog.derived import described
+from rig.catalog.describing import described
 from rig.catalog.exchange.new_files import new_file, new_folder
-from rig.catalog.facts import Enrollment, View
+from rig.catalog.facts import View
 from rig.catalog.images import path_of
-from rig.catalog.records import EnrollmentStatus, Region
+from rig.catalog.records import Region
 from rig.catalog.transfer import CatalogSource, TransferItem
 from rig.core.errors import ExportFailed, UsageError
 from rig.core.next_steps import Do
@@ -78,21 +78,6 @@ class TableFormat(StrEnum):
             raise UsageError(f"The format of {path} is unknown.", next_step=f"Give a file with {known}.") from error
 
 
-class ExportedObject(NamedTuple):
-    """An object and its complete enrollment."""
-
-    item: TransferItem
-    enrollment: Enrollment
-
-
-def enrolled(source: CatalogSource) -> Iterator[ExportedObject]:
-    """Yield the objects that are completely enrolled, with the enrollment that searches use."""
-    for item in source.items():
-        for one in item.enrollments:
-            if one.status is EnrollmentStatus.COMPLETE:
-                yield ExportedObject(item, one.enrollment)
-
-
 def write_folder(folder: Path, source: CatalogSource) -> int:
     """Write copies of the images as ``obj{N}__{azimuth}.png``, as in COIL-100, with a table `TABLE`.
 
@@ -103,23 +88,23 @@ def write_folder(folder: Path, source: CatalogSource) -> int:
     Raises `ExportFailed`: the folder is not empty or cannot be written, or an object has two views from the same
     azimuth.
     """
-    objects = list(enrolled(source))
+    items = list(source.items())
 
     def placed() -> Iterator[dict[str, Any]]:
-        for number, one in enumerate(objects, 1):
-            for row, view in _rows(source, one):
+        for number, item in enumerate(items, 1):
+            for row, view in _rows(source, item):
                 angle = np.format_float_positional(view.azimuth_deg, trim="-")
                 target = made / f"obj{number}__{angle}{Path(view.image).suffix}"
                 if target.exists():
                     raise ExportFailed(
-                        f"{one.item.name!r} has two views from {angle}°.", next_step="Export a bundle instead."
+                        f"{item.name!r} has two views from {angle}°.", next_step="Export a bundle instead."
                     )
                 target.write_bytes(source.catalog.database.images.content(view.image))
                 yield {**row, "image": target.name}
 
     with new_folder(folder) as made:
         write_rows(made / TABLE, TableFormat.CSV, VIEWS, placed())
-    return len(objects)
+    return len(items)
 
 
 def write_views(path: Path, source: CatalogSource, form: TableFormat) -> int:
@@ -127,9 +112,9 @@ def write_views(path: Path, source: CatalogSource, form: TableFormat) -> int:
 
     Raises `ExportFailed`: the file exists already or cannot be written, or pyarrow is not installed.
     """
-    objects = list(enrolled(source))
-    write_rows(path, form, VIEWS, (row for one in objects for row, _ in _rows(source, one)))
-    return len(objects)
+    items = list(source.items())
+    write_rows(path, form, VIEWS, (row for item in items for row, _ in _rows(source, item)))
+    return len(items)
 
 
 def write_rows(path: Path, form: TableFormat, columns: Mapping[str, type], rows: Iterable[dict[str, Any]]) -> None:
@@ -188,11 +173,11 @@ def parse_region(text: str) -> Region | None:
     return x, y, width, height
 
 
-def _rows(source: CatalogSource, one: ExportedObject) -> Iterator[tuple[dict[str, Any], View]]:
+def _rows(source: CatalogSource, item: TransferItem) -> Iterator[tuple[dict[str, Any], View]]:
     """Yield the views of an object, each with its row: the columns `VIEWS`."""
     kind = descriptor(PAPER_DESCRIPTOR)
-    item, enrollment = one
-    levels_of = described(source.catalog, enrollment, item.name, kind.name).levels[kind.name]
+    enrollment = item.enrollment
+    levels_of = described(source.catalog.database, enrollment, item.name, kind.name).levels[kind.name]
     for view, levels in zip(enrollment.views, levels_of, strict=True):
         by = enrollment.sessions[view.session].provenance
         row = {

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from hbr.segmentation import BoxMethod
 from rig.catalog.catalog import Catalog
-from rig.catalog.derived import described
+from rig.catalog.describing import described
 from rig.catalog.exchange.new_files import new_folder
-from rig.catalog.exchange.tables import enrolled
 from rig.catalog.facts import Session, View
 from rig.catalog.images import FolderImages, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
@@ -95,19 +94,20 @@ def write_training(
 
     Raises `ExportFailed`: the folder is not empty or cannot be written, or there are no views.
     """
-    objects = list(enrolled(source))
-    if not objects:
+    items = list(source.items())
+    if not items:
         raise ExportFailed("There are no complete enrollments to export.", next_step=Do.ENROLL())
     with new_folder(folder) as made:
         # Copy the objects. The images get the permissions of the database: who may enter the folder may read them.
         with Catalog.open(made, clock=source.catalog.clock) as copy:
             (made / DATABASE_NAME).chmod(0o644)
-            yield from transfer(CatalogSource(source.catalog, source.names, used_only=True), copy, jobs=jobs)
+            yield from transfer(source, copy, jobs=jobs)
         # Describe the views that are not described yet. Of several views with the same image the first is used.
         pictures: dict[str, _Picture] = {}
-        for number, (item, enrollment) in enumerate(objects):
-            yield JobProgress(number, len(objects))
-            evidence = described(source.catalog, enrollment, item.name).segmentation
+        for number, item in enumerate(items):
+            yield JobProgress(number, len(items))
+            enrollment = item.enrollment
+            evidence = described(source.catalog.database, enrollment, item.name).segmentation
             for view, found in zip(enrollment.views, evidence, strict=True):
                 own = (number, view, enrollment.sessions[view.session], json.dumps(found))
                 pictures.setdefault(view.image, _Picture(len(pictures), *own))
@@ -121,13 +121,12 @@ def write_training(
         parts: dict[str, list[_Annotated]] = {part: [] for part in PARTS}
         for picture in pictures.values():
             parts[_PART_OF.get(picture.view.index % 10, "train")].append((picture, masks[picture.id]))
-        items = [item for item, _ in objects]
         if form is Annotations.COCO:
             _write_coco(made, items, parts)
         else:
             _write_yolo(made, items, parts)
     without = sum(mask.box is None for mask in masks.values())
-    return TrainingExport(len(objects), {part: len(own) for part, own in parts.items()}, without)
+    return TrainingExport(len(items), {part: len(own) for part, own in parts.items()}, without)
 
 
 # Masks

@@ -70,8 +70,7 @@ def show(settings: Settings, name: NameArgument) -> None:
 
     Example: rig catalog show mug-white --bench sim
     """
-    from rig.catalog.derived import described
-    from rig.catalog.describing import Described
+    from rig.catalog.describing import Described, described
     from rig.core.errors import CatalogError
 
     found, problem = Described({}, ()), None
@@ -79,7 +78,7 @@ def show(settings: Settings, name: NameArgument) -> None:
         details = catalog.object(name)
         try:
             if details.complete is not None:
-                found = described(catalog, details.complete, details.summary.name)
+                found = described(catalog.database, details.complete, details.summary.name)
         except CatalogError as error:  # an image is missing: the rest is shown before
             problem = error
     if settings.json:

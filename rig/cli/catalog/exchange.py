@@ -73,7 +73,7 @@ def import_(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
     jobs: JobsOption = None,
 ) -> None:
-    """Import photographs with known angles, or objects of another catalog with all their enrollments; all or nothing.
+    """Import photographs with known angles, or the enrolled objects of another catalog; all or nothing.
 
     Example: rig import coil-100 --label coil --bench sim
 
@@ -81,10 +81,11 @@ def import_(
 
     Example: rig import /media/stick/catalog --on-conflict skip --bench sim
     """
+    from rig.catalog.derived import load_views
     from rig.catalog.exchange.photographs import Photographs
     from rig.catalog.transfer import Conflict, transfer
     from rig.core.json_form import plain
-    from rig.views.description import DESCRIPTORS
+    from rig.views.description import BENCH_DESCRIPTOR
 
     clock = SystemClock()
     begin_ns = clock.now_ns()
@@ -93,12 +94,14 @@ def import_(
             *(objects, catalog),
             conflict=Conflict(on_conflict),
             label=label,
-            descriptors=DESCRIPTORS,
             jobs=jobs,
             dry_run=dry_run,
         )
         what = "checking" if dry_run else "importing"
         done = run_job(what, job, interrupted="Interrupted; nothing was imported.")
+        if not dry_run:  # so that the next search does not wait
+            later = "Interrupted; everything was imported. The next search describes the views."
+            run_job("describing", load_views(catalog, BENCH_DESCRIPTOR), interrupted=later)
     seconds = seconds_between(begin_ns, clock.now_ns())
     lines = [
         f"{'Would import' if dry_run else 'Imported'} {counted(done.objects, 'object')} with "
@@ -189,7 +192,7 @@ def export(
 ) -> None:
     """Export objects in an open format.
 
-    Formats: bundle (everything, for rig import), folder (images named as in COIL-100, with a table views.csv), csv,
+    Formats: bundle (for rig import), folder (images named as in COIL-100, with a table views.csv), csv,
     json and parquet (table without images), coco and yolo (training sets with boxes and masks, divided into train, val
     and test).
 

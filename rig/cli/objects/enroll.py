@@ -187,12 +187,12 @@ class _Shown:
 
     def _complete(self) -> None:
         """Add the views of earlier sessions to the record of a resumed enrollment."""
-        from rig.catalog.derived import described
+        from rig.catalog.describing import described
 
         record, catalog = self._records[-1], self.desk.catalog
         stored = catalog.object(record.name).complete
         if stored is not None and len(stored.views) > len(record.views):
-            segmented = described(catalog, stored, record.name).segmentation
+            segmented = described(catalog.database, stored, record.name).segmentation
             record.complete(
                 (view, one, catalog.read_image(view.image)) for view, one in zip(stored.views, segmented, strict=True)
             )

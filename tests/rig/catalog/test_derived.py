@@ -15,7 +15,7 @@ import hbr
 from hbr.descriptors import network
 from hbr.descriptors.registry import FULL
 from rig.catalog import Catalog, Enrollment, derived, describing
-from rig.catalog.describing import SEGMENTATION
+from rig.catalog.describing import SEGMENTATION, described
 from rig.catalog.facts import Derived, seal_of
 from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.verify import CatalogProblem, verify
@@ -227,13 +227,13 @@ def test_a_catalog_that_is_read_only_is_described_in_memory(catalog: Catalog, mo
 @pytest.mark.parametrize("evidence", ["[]", "{}", "[1]", "[NaN, NaN, NaN, NaN]", "null", "[" * 5000, '[{"issues": 5}]'])
 def test_evidence_that_no_program_wrote_is_computed_again(catalog: Catalog, evidence: str) -> None:
     enrollment = complete(catalog, "box")
-    expected = derived.described(catalog, enrollment, "box")
+    expected = described(catalog.database, enrollment, "box")
     assert SegmentationSummary.of(expected.segmentation).found == VIEWS
     (seal,) = {seal for seal, what in rows(catalog) if seal == seal_of(enrollment)}
     with catalog.database.write() as transaction:
         transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == SEGMENTATION))
         transaction.execute(insert(Derived).values(describing.row_of(seal, SEGMENTATION, evidence.encode())))
-    found = derived.described(catalog, enrollment, "box")
+    found = described(catalog.database, enrollment, "box")
     assert found.segmentation == expected.segmentation
     assert all(np.array_equal(found.levels[name], expected.levels[name]) for name in DESCRIPTORS)
 
@@ -318,10 +318,10 @@ def test_views_are_described_the_same_in_several_threads(
 ) -> None:
     stored = rows(catalog)
     forget(catalog)
-    monkeypatch.setattr(derived, "THREADS", threads)
+    monkeypatch.setattr(describing, "THREADS", threads)
     for name in NAMES:
         enrollment = complete(catalog, name)
-        derived.described(catalog, enrollment, name)
+        described(catalog.database, enrollment, name)
     assert rows(catalog) == stored
 
 

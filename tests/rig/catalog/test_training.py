@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from rig.catalog import Catalog, Provenance, View
-from rig.catalog.derived import described
+from rig.catalog.describing import described
 from rig.catalog.exchange.training import Annotations, write_training
 from rig.catalog.transfer import CatalogSource
 from rig.catalog.verify import verify
@@ -90,7 +90,7 @@ def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path
     for name in ("mug", 'tin: "7"'):
         found = catalog.object(name)
         assert found.complete is not None
-        views += zip(found.views, described(catalog, found.complete, name).segmentation, strict=True)
+        views += zip(found.views, described(catalog.database, found.complete, name).segmentation, strict=True)
     for (view, evidence), picture, annotation in zip(views, content["images"], content["annotations"], strict=True):
         assert (tmp_path / "out" / picture["file_name"]).read_bytes() == catalog.image_path(view.image).read_bytes()
         assert picture["azimuth_deg"] == annotation["azimuth_deg"] == view.azimuth_deg

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hbr.dense import stopping
 from hbr.segmentation import BoxMethod
 from rig.catalog import Catalog, derived
+from rig.catalog.describing import described
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, transfer
@@ -85,7 +86,7 @@ def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strat
                 writer.add(event)
                 views += [event] if isinstance(event, Accepted) else []
         stored = catalog.object("mug-dots").complete
-        methods = {one["method"] for one in derived.described(catalog, stored, "mug-dots").segmentation}
+        methods = {one["method"] for one in described(catalog.database, stored, "mug-dots").segmentation}
         # Every copy of the object has all images: here a bundle.
         write_bundle(tmp_path / "a.zip", CatalogSource(catalog))
     again = check(load_run(tmp_path / "run"))

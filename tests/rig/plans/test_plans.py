@@ -7,7 +7,7 @@ import pytest
 import hbr
 from hbr.core.angles import wrap180
 from rig.catalog import Catalog, derived
-from rig.catalog.describing import FEWEST_VIEWS
+from rig.catalog.describing import FEWEST_VIEWS, described
 from rig.core.errors import (
     CameraSettingsDiffer,
     CatalogError,
@@ -80,7 +80,7 @@ def test_enrolled_views_are_described_together(simulated, catalog, interrupted_a
     images = [catalog.read_image(view.image) for view in stored.views]
     tables = [catalog.read_image(session.empty_table) for session in stored.sessions]
     sessions = [view.session for view in stored.views]
-    found = derived.described(catalog, stored, "teapot")
+    found = described(catalog.database, stored, "teapot")
     for index, image in enumerate(images):
         own = [n for n, session in enumerate(sessions) if session == sessions[index]]
         learned = own if len(own) >= FEWEST_VIEWS else range(VIEWS)
@@ -355,7 +355,7 @@ def test_resume_finishes_an_enrollment_that_has_all_its_views(simulated, catalog
     events = list(enroll(s.bench, catalog, "dice", resume=True))
     assert [type(event) for event in events] == [Started, Enrolled]
     assert catalog.object("dice").summary.views == 4
-    found = derived.described(catalog, catalog.object("dice").complete, "dice")
+    found = described(catalog.database, catalog.object("dice").complete, "dice")
     assert {one["together"] for one in found.segmentation} == {4}
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from rig.bench import Bench
 from rig.catalog import Catalog, derived
+from rig.catalog.describing import described
 from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
 from rig.core.next_steps import Do
@@ -276,7 +277,7 @@ def test_enrolled_views_have_both_descriptors_evidence_and_the_image(simulated: 
         (session,) = details.complete.sessions
         assert session.empty_table is not None
         assert np.array_equal(catalog.read_image(session.empty_table), empty_table_status(s.bench).table.image_bgr)
-        evidence = derived.described(catalog, details.complete, "toy-car").segmentation
+        evidence = described(catalog.database, details.complete, "toy-car").segmentation
     assert loaded.descriptor == BENCH_DESCRIPTOR
     assert len(loaded) == 4
     summary = SegmentationSummary.of(evidence)
@@ -292,7 +293,7 @@ def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_
     s.operator.change_bench(CHANGES["bench"])
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         warned = [event for event in enroll(s.bench, catalog, "toy-car", views=6) if isinstance(event, Warned)]
-        evidence = derived.described(catalog, catalog.object("toy-car").complete, "toy-car").segmentation
+        evidence = described(catalog.database, catalog.object("toy-car").complete, "toy-car").segmentation
     assert [event.index for event in warned] == [2]
     assert warned[0].note.code is NoteCode.EMPTY_TABLE_CHANGED
     assert Do.EMPTY_TABLE() in note_steps(warned[0].note)

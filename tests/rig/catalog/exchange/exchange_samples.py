@@ -38,13 +38,16 @@ def fill_full(catalog: Catalog) -> None:
     tin = catalog.begin("tin", planned_azimuth_deg=plan(3), provenance=PROVENANCE, empty_table=image(99))
     tin.add(record(0, imu_deg=0.1, imu_sigma_deg=0.5), image(30))
     tin = catalog.resume("tin", provenance=PROVENANCE)
+    tin.add(record(1), image(31))
     tin.add(record(2, evidence={"sharpness": 12.5, "locks": {"gain": None}}), image(32))
+    tin.finish()
+    catalog.begin("cup", planned_azimuth_deg=plan(2), provenance=PROVENANCE).add(record(0), image(70))
 
 
 def run_import(
     catalog: Catalog, source: TransferSource, conflict: Conflict = Conflict.REJECT, **options: Any
 ) -> Transferred:
-    return finished(transfer(source, catalog, conflict=conflict, **{"jobs": 1, "descriptors": ["cedd"], **options}))
+    return finished(transfer(source, catalog, conflict=conflict, **{"jobs": 1, **options}))
 
 
 def import_bundle(catalog: Catalog, path: Path, **options: Any) -> Transferred:
@@ -122,8 +125,5 @@ def changed_bundle(bundle: Path, target: Path, change: Callable[[Path], None], m
 
 def facts(item: TransferItem) -> tuple[object, ...]:
     """Everything that a transfer keeps of an object."""
-    enrollments = [
-        (one.enrollment.key, seal_of(one.enrollment), one.status, one.finished_utc, one.seal)
-        for one in item.enrollments
-    ]
-    return item.name, item.label, item.note, item.created_utc, enrollments
+    enrollment = item.enrollment.key, seal_of(item.enrollment), item.finished_utc
+    return item.name, item.label, item.note, item.created_utc, enrollment

@@ -13,10 +13,9 @@ from rig.catalog.exchange.photographs import Photographs, read_folder
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists
-from rig.views.description import DESCRIPTORS
 from sim.clock import VirtualClock
 from tests.programs import server
-from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image, record
+from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, fill, finished
 from tests.rig.catalog.exchange.exchange_samples import model, photograph, run_import, untouched
 
 
@@ -34,7 +33,7 @@ class TestAllOrNothing:
         self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog, after: int
     ) -> None:
         catalog = open_catalog("catalog")
-        job = transfer(photographs(), catalog, descriptors=["cedd"], jobs=1)
+        job = transfer(photographs(), catalog, jobs=1)
         for _ in range(after + 1):
             next(job)
         job.close()
@@ -157,11 +156,7 @@ class TestOnlyOnce:
         assert run_import(catalog, CatalogSource(full, ["mug-white"]), once=True).objects == 0
         done = run_import(catalog, CatalogSource(full, ["mug-white"]), Conflict.REPLACE)
         assert done.replaced == ("mug-white",)
-        assert [one.status for one in catalog.object("mug-white").enrollments] == [
-            "superseded",
-            "complete",
-            "superseded",
-        ]
+        assert [one.status for one in catalog.object("mug-white").enrollments] == ["superseded", "complete"]
         assert catalog.object("mug-white").summary.views == 4
         assert finished(verify(catalog)).findings == ()
 
@@ -174,30 +169,16 @@ class TestOnlyOnce:
         assert run_import(catalog, CatalogSource(full), once=True).objects == 0
         assert run_import(catalog, CatalogSource(full)).objects == 1
         assert [item.name for item in catalog.objects()] == ["Tässe =2+2", "tin", "mug-white"]
-        assert model(catalog)[0] == ("Tässe =2+2", "mug-white")
-        assert finished(verify(catalog)).findings == ()
-
-    def test_enrollment_that_was_continued_elsewhere_is_another_one(
-        self, full: Catalog, open_catalog: OpenCatalog
-    ) -> None:
-        catalog = open_catalog("catalog")
-        run_import(catalog, CatalogSource(full))
-        there = full.resume("tin", provenance=PROVENANCE)
-        there.add(record(1), image(31))
-        there.finish()
-        with pytest.raises(ObjectExists):
-            run_import(catalog, CatalogSource(full, ["tin"]))
-        run_import(catalog, CatalogSource(full, ["tin"]), Conflict.REPLACE)
-        assert [one.status for one in catalog.object("tin").enrollments] == ["complete", "in progress"]
+        assert model(catalog)[0] == ("Tässe =2+2", "tin", "mug-white")
         assert finished(verify(catalog)).findings == ()
 
     def test_what_was_computed_goes_with_a_delivery(
         self, full: Catalog, open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         catalog = open_catalog("catalog")
-        run_import(catalog, CatalogSource(full), once=True, descriptors=[])
+        run_import(catalog, CatalogSource(full), once=True)
         expected = model(full)
-        monkeypatch.setattr("rig.catalog.describing.describe", None)
+        monkeypatch.setattr("rig.catalog.describing._describe", None)
         assert model(catalog) == expected
 
     def test_damaged_image_of_a_catalog_is_not_transferred(self, full: Catalog, open_catalog: OpenCatalog) -> None:
@@ -217,6 +198,6 @@ class TestOnlyOnce:
         full.image_path(table).write_bytes(b"x")
         catalog = open_catalog("catalog")
         with pytest.raises(ImportRejected) as error:
-            run_import(catalog, CatalogSource(full, own=False), descriptors=DESCRIPTORS)
+            run_import(catalog, CatalogSource(full, own=False))
         assert error.value.evidence["rejected"] == [f"{table}: is not the stored image"]
         assert untouched(catalog)

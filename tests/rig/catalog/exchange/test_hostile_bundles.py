@@ -104,8 +104,8 @@ class TestHostileBundles:
             ("UPDATE views SET captured_utc = 'yesterday'", "yesterday|datetime"),
             ("DELETE FROM views WHERE view_index = 1", "belongs to no view|changed after"),
             ("UPDATE log SET finished_utc = NULL", "changed after"),
-            ("UPDATE log SET status = 'in progress'", "changed after"),
-            ("UPDATE log SET status = 'finished'", "finished"),
+            ("UPDATE log SET status = 'in progress'", "not complete"),
+            ("UPDATE log SET status = 'finished'", "not complete"),
             ("UPDATE log SET object_id = 9", "owner of an enrollment"),
             ("UPDATE properties SET value = '2' WHERE key = 'version'", "another version"),
             ("UPDATE properties SET value = 'x' WHERE key = 'head'", "end of its log"),
@@ -121,17 +121,10 @@ class TestHostileBundles:
         said = self.rejection(open_catalog, rewritten(bundle, statement, sealed=sealed))
         assert not sealed or any(word in said for word in words.split("|")), said
 
-    @pytest.mark.parametrize(
-        ("views", "words"),
-        [(20_000, "changed after"), (0, "changed after")],
-    )
-    def test_impossible_plans_are_rejected(
-        self, bundle: Path, open_catalog: OpenCatalog, views: int, words: str
-    ) -> None:
+    @pytest.mark.parametrize("views", [20_000, 0])
+    def test_impossible_plans_are_rejected(self, bundle: Path, open_catalog: OpenCatalog, views: int) -> None:
         plan = f"UPDATE enrollments SET planned_azimuth_deg = '{json_text([0.0] * views)}'"
-        unfinished = "UPDATE log SET status = 'in progress', finished_utc = NULL WHERE status IS NOT NULL"
-        said = self.rejection(open_catalog, rewritten(bundle, plan, unfinished))
-        assert any(word in said for word in words.split("|")), said
+        assert "changed after" in self.rejection(open_catalog, rewritten(bundle, plan))
 
     def test_image_that_is_another_one_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         other = bytearray(encode(image(0)))

@@ -12,7 +12,6 @@ from rig.catalog import Catalog
 from rig.catalog.derived import views
 from rig.catalog.exchange.photographs import read_folder, read_table
 from rig.catalog.incoming import ImportProblem
-from rig.catalog.jobs import JobProgress
 from rig.catalog.sessions import empty_tables
 from rig.catalog.transfer import Conflict
 from rig.catalog.verify import verify
@@ -61,7 +60,7 @@ class TestFolders:
         for seed, name in enumerate(names):
             photograph(tmp_path / name, seed)
         source = read_folder(tmp_path, pattern=pattern, now=NOW)
-        assert {item.name: item.enrollments[0].enrollment.planned_azimuth_deg for item in source.items()} == {
+        assert {item.name: item.enrollment.planned_azimuth_deg for item in source.items()} == {
             "mug": (0.0, 90.0),
             "tin": (0.0,),
         }
@@ -76,7 +75,7 @@ class TestFolders:
         for angle in (0, 5, 355):
             photograph(tmp_path / f"obj1__{angle}.png", angle)
         (item,) = read_folder(tmp_path, table_angles=True, now=NOW).items()
-        shown = {Path(view.image).stem: view.azimuth_deg for view in item.enrollments[0].enrollment.views}
+        shown = {Path(view.image).stem: view.azimuth_deg for view in item.enrollment.views}
         assert shown == {"obj1__0": 0.0, "obj1__5": 355.0, "obj1__355": 5.0}
 
     def test_unusable_files_are_rejected_one_by_one(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
@@ -215,7 +214,7 @@ class TestEmptyTables:
         batch = read_folder(folder, now=NOW)
         batch.use_empty_tables(tmp_path / "empty.png")
         catalog = open_catalog("catalog")
-        done = run_import(catalog, batch, descriptors=DESCRIPTORS)
+        done = run_import(catalog, batch)
         assert empty_tables(catalog).with_image == ("mug", "tin")
         stored = self.stored(catalog, "mug")
         assert stored == {0.0: (tmp_path / "empty.png").read_bytes(), 90.0: (tmp_path / "empty.png").read_bytes()}
@@ -291,7 +290,7 @@ class TestEmptyTables:
             cv2.imwrite(str(tmp_path / f"{name}{suffix}"), np.zeros((32, 32), np.uint8))
         batch = read_folder(tmp_path, now=NOW)
         batch.use_empty_tables(tmp_path / f"empty{suffix}")
-        assert {session.empty_table for session in next(batch.items()).enrollments[0].enrollment.sessions} == {
+        assert {session.empty_table for session in next(batch.items()).enrollment.sessions} == {
             str(tmp_path / f"empty{suffix}")
         }
 
@@ -304,20 +303,16 @@ class TestEmptyTables:
         (tmp_path / "empty.png").unlink()
         catalog = open_catalog("catalog")
         with pytest.raises(ImportRejected):
-            run_import(catalog, batch, descriptors=DESCRIPTORS)
+            run_import(catalog, batch)
         assert untouched(catalog, images=True)
 
-    def test_small_photographs_are_described_as_a_whole_and_at_once(
-        self, folder: Path, open_catalog: OpenCatalog
-    ) -> None:
+    def test_small_photographs_are_described_as_a_whole(self, folder: Path, open_catalog: OpenCatalog) -> None:
         batch = read_folder(folder, now=NOW)
         assert batch.are_whole
         catalog = open_catalog("catalog")
-        run_import(catalog, batch, descriptors=DESCRIPTORS)
-        described_now: list[JobProgress] = []
+        run_import(catalog, batch)
         for name in DESCRIPTORS:
-            assert len(load_model(catalog, descriptor=name, progress=described_now.append).views) == 4
-        assert described_now == []
+            assert len(load_model(catalog, descriptor=name).views) == 4
         (mug, _) = load_catalog(catalog).objects
         assert [one.region for one in mug.photographs] == [None, None]
         assert load_catalog(catalog).image(0, 0).shape == (32, 32, 3)

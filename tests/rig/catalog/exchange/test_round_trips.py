@@ -13,7 +13,7 @@ from rig.catalog import Catalog
 from rig.catalog.exchange.bundle import write_bundle
 from rig.catalog.transfer import CatalogSource, Conflict
 from rig.catalog.verify import verify
-from rig.core.errors import CatalogDamaged, ExportFailed, ObjectExists
+from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectExists
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image
 from tests.rig.catalog.exchange.exchange_samples import facts, import_bundle, model, pictures, run_import, untouched
@@ -28,13 +28,16 @@ class TestBundles:
         assert write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full)) == 3
         other = open_catalog("copy")
         done = import_bundle(other, tmp_path / "a.rigcat.zip")
-        assert (done.objects, done.views) == (3, 11)
+        assert (done.objects, done.views) == (3, 9)
         assert finished(verify(other)).findings == ()
         assert everything(other) == everything(full)
         assert model(other) == model(full)
         assert pictures(other) == pictures(full)
-        tin = other.resume("tin", provenance=PROVENANCE)  # an unfinished enrollment continues in the copy
-        assert tin.missing() == (1,)
+
+    def test_unfinished_enrollment_is_not_exported(self, full: Catalog, tmp_path: Path) -> None:
+        with pytest.raises(CatalogError, match="'cup' is unfinished"):
+            write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["tin", "cup"]))
+        assert not (tmp_path / "a.rigcat.zip").exists()
 
     def test_bundle_contains_the_named_objects(self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path) -> None:
         write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["tin", "Tässe =2+2"]))
@@ -51,7 +54,7 @@ class TestBundles:
                 "SELECT log.object_name, views.image FROM log JOIN views ON views.enrollment_id = log.enrollment_id "
                 "WHERE log.status = 'complete' AND views.view_index = 0 ORDER BY log.id"
             ).fetchall()
-        assert [name for name, _ in rows] == ["mug-white", "Tässe =2+2"]
+        assert [name for name, _ in rows] == ["mug-white", "Tässe =2+2", "tin"]
         stored = cv2.imread(str(tmp_path / "unpacked" / "images" / rows[0][1][:2] / rows[0][1]))
         assert stored is not None
         assert np.array_equal(stored, image(20))
@@ -96,5 +99,5 @@ class TestMerge:
         assert done.replaced == ("mug-white", "tin")
         assert [one.label for one in other.objects()] == ["mine", "", "theirs"]
         statuses = [[str(one.status) for one in other.object(name).enrollments] for name in ("mug-white", "tin")]
-        assert statuses == [["complete", "superseded", "superseded"], ["in progress", "abandoned"]]
+        assert statuses == [["complete", "superseded"], ["complete", "in progress"]]
         assert finished(verify(other)).findings == ()
