@@ -115,7 +115,7 @@ class PhotographedObjects:
             raise ConfigError(
                 f"{options.source} has no photograph that can be used.",
                 next_step="Correct the listed files.",
-                evidence={"rejected": [f"{file.path} {file.reason}" for file in found.rejected[:_SHOWN]]},
+                evidence={"rejected": [str(file) for file in found.rejected[:_SHOWN]]},
             )
         enrolled, identified = {}, {}
         for name, one in views.items():
@@ -266,7 +266,7 @@ def _empty_table(found: Photographs, options: PhotographOptions) -> PhotographsO
 def _rejected(found: Photographs) -> tuple[str, ...]:
     if not found.rejected:
         return ()
-    shown = [f"{file.path} {file.reason}" for file in found.rejected[:_SHOWN]]
+    shown = [str(file) for file in found.rejected[:_SHOWN]]
     more = len(found.rejected) - _SHOWN
     shown += [f"and {more} others"] if more > 0 else []
     return (f"camera: {counted(len(found.rejected), 'file')} of {found.origin} not used: {'; '.join(shown)}",)

@@ -6,9 +6,9 @@ A file that cannot be used is rejected, with the reason.
 import zlib
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, field
-from enum import Enum, unique
+from enum import StrEnum
 from functools import partial
-from typing import Any, Final
+from typing import Final
 from zipfile import BadZipFile
 
 from rig.catalog.facts import Enrollment
@@ -21,45 +21,33 @@ from rig.views.description import within
 from rig.views.image_files import BadImage, decode
 
 
-@unique
-class ImportProblem(Enum):
-    """A reason why a file is not imported: the name is its code, the value the template of its text."""
+class ImportProblem(StrEnum):
+    """The kinds of reasons why a file is not imported."""
 
-    NOT_A_FILE = "is not a file"
-    LINK_OUTSIDE = "is a link to a file outside the folder"
-    NAME_PATTERN = "does not match the pattern {pattern}"
-    SAME_AZIMUTH = "shows {name!r} from the same azimuth as {other}"
-    INVALID_VALUE = "{error}"
-    UNREADABLE = "cannot be read: {error}"
-    INVALID_IMAGE = "cannot be used: {error}"
-    OTHER_IMAGE = "is not the stored image"
-    NOT_DESCRIBED = "cannot be described: {error}"
-
-
-@dataclass(frozen=True, slots=True)
-class Reason:
-    """An `ImportProblem` with the values of its text."""
-
-    code: ImportProblem
-    values: dict[str, Any] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        return self.code.value.format_map(self.values)
+    NOT_A_FILE = "not_a_file"
+    LINK_OUTSIDE = "link_outside"
+    NAME_PATTERN = "name_pattern"
+    SAME_AZIMUTH = "same_azimuth"
+    INVALID_VALUE = "invalid_value"
+    UNREADABLE = "unreadable"
+    INVALID_IMAGE = "invalid_image"
+    OTHER_IMAGE = "other_image"
+    NOT_DESCRIBED = "not_described"
 
 
 @dataclass(frozen=True, slots=True)
 class RejectedFile:
-    """A file that is not imported, and why."""
+    """A file that is not imported, and the reason, which follows the path in a sentence."""
 
     path: str
-    reason: Reason
+    code: ImportProblem
+    reason: str
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the file with the code and the text of the reason."""
-        code = self.reason.code.name.lower()
-        return {"path": self.path, "code": code, "values": self.reason.values, "reason": str(self.reason)}
+    def __str__(self) -> str:
+        return f"{self.path} {self.reason}"
 
 
+OTHER_IMAGE: Final = "is not the stored image"
 _READ_ERRORS: Final = (
     OSError,
     BadZipFile,
@@ -102,11 +90,7 @@ class ReadImages:
     """What was read: name and size in bytes of each image, or the reason why it cannot be used."""
 
     images: dict[str, tuple[str, int]] = field(default_factory=dict)
-    rejected: dict[str, Reason] = field(default_factory=dict)
-
-    @property
-    def rejected_files(self) -> tuple[RejectedFile, ...]:
-        return tuple(RejectedFile(image, reason) for image, reason in self.rejected.items())
+    rejected: dict[str, RejectedFile] = field(default_factory=dict)
 
 
 def read_images(
@@ -136,22 +120,22 @@ def _read(reading: Reading, wanted: _Wanted) -> ReadImages:
     """Read the images of an enrollment. Runs in a worker process."""
     found = ReadImages()
     for image, region in wanted:
-        reason = None
+        code, reason = None, ""
         try:
             content = reading.content(image)
             name = name_of(content)
             if reading.is_named and name != image:
-                reason = Reason(ImportProblem.OTHER_IMAGE)
+                code, reason = ImportProblem.OTHER_IMAGE, OTHER_IMAGE
             elif reading.decodes:
                 within(decode(content), region)
         except BadImage as error:
-            reason = Reason(ImportProblem.INVALID_IMAGE, {"error": str(error)})
+            code, reason = ImportProblem.INVALID_IMAGE, f"cannot be used: {error}"
         except UsageError as error:
-            reason = Reason(ImportProblem.NOT_DESCRIBED, {"error": error.what.rstrip(".")})
+            code, reason = ImportProblem.NOT_DESCRIBED, f"cannot be described: {error.what.rstrip('.')}"
         except (CatalogDamaged, *_READ_ERRORS) as error:  # a link that leads out of a catalog is damage
-            reason = Reason(ImportProblem.UNREADABLE, {"error": str(error)})
-        if reason is not None:
-            found.rejected[image] = reason
+            code, reason = ImportProblem.UNREADABLE, f"cannot be read: {error}"
+        if code is not None:
+            found.rejected[image] = RejectedFile(image, code, reason)
             continue
         if reading.store is not None and image not in found.images:
             reading.store.put(content, settled=False)

@@ -4,7 +4,6 @@ A catalog may come from an untrusted sender: its records and its folder can cont
 """
 
 import os
-import shlex
 import stat
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,15 +13,12 @@ from typing import Final
 from rig.catalog.columns import FIX
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import CatalogDamaged
-from rig.core.files import make_folder, open_regular
+from rig.core.files import make_folder
 from rig.views.image_files import IMAGE_FOLDER
 
 _OWN: Final = (DATABASE_NAME, IMAGE_FOLDER)
 _BESIDE: Final = tuple(f"{DATABASE_NAME}-{suffix}" for suffix in ("wal", "shm", "journal"))
 """Files that SQLite itself writes beside the database."""
-
-_NAMES_ANOTHER_FILE: Final = bytes.fromhex("d9d505f920a163d7")
-"""Last bytes of a rollback journal with a super-journal record (https://sqlite.org/fileformat.html, section 3)."""
 
 
 def check_folder(root: Path) -> None:
@@ -55,21 +51,14 @@ def _check_rollback_journal(root: Path) -> None:
     """
     journal = root / f"{DATABASE_NAME}-journal"
     try:
-        # SQLite does not lock this file. The locks on the database would be lost if the database were opened here.
-        with open_regular(journal) as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(size - len(_NAMES_ANOTHER_FILE), 0))
-            names_a_file = file.read() == _NAMES_ANOTHER_FILE
+        size = journal.lstat().st_size
     except FileNotFoundError:
         return
     if size:
-        finish = f"sqlite3 {shlex.quote(str(root / DATABASE_NAME))} 'PRAGMA integrity_check'"
         raise CatalogDamaged(
-            f"{os.fspath(journal)!r} is a journal of another program"
-            f"{', and SQLite would delete the file that it names' * names_a_file}. Nothing was opened or changed.",
-            next_step=FIX
-            if names_a_file
-            else f"{FIX} If you killed another program that changed the catalog, finish its change: {finish}",
+            f"{os.fspath(journal)!r} is a journal of another program. SQLite would change the catalog by it, and "
+            "delete the file that it may name. Nothing was opened or changed.",
+            next_step=FIX,
             evidence={"bytes": size},
         )
 

@@ -30,7 +30,7 @@ from rig.catalog.facts import (
     seal_of,
     sha256_of,
 )
-from rig.catalog.incoming import ImportProblem, ReadImages, Reading, Reason, RejectedFile, read_images
+from rig.catalog.incoming import OTHER_IMAGE, ImportProblem, ReadImages, Reading, RejectedFile, read_images
 from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
 from rig.catalog.state import EnrollmentState, Named
@@ -205,7 +205,7 @@ def transfer(
     )
     with target.database.catalog_errors():
         found = yield from read_images(reading, enrollments, strict=strict and not dry_run, jobs=jobs)
-    rejected = (*source.rejected, *found.rejected_files)
+    rejected = (*source.rejected, *found.rejected.values())
     plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=catalog is None))
     tables = {session.empty_table for one in enrollments for session in one.sessions}
     if (strict and rejected) or (found.rejected and not plan.wanted) or not tables.isdisjoint(found.rejected):
@@ -218,7 +218,7 @@ def transfer(
                 storing = replace(reading, store=store, decodes=False)
                 again = yield from read_images(storing, enrollments, strict=True, jobs=jobs)
                 if again.rejected:  # the source has just been changed
-                    raise _rejection(source, again.rejected_files)
+                    raise _rejection(source, [*again.rejected.values()])
             store.settle({name for name, _ in found.images.values()})
         with target.database.write() as transaction:
             plan = plan.compared(transaction, conflict, once=once)  # another process may have added objects
@@ -226,7 +226,7 @@ def transfer(
             for image, (name, _) in found.images.items():
                 # `collect_garbage` removed it: an object that was deleted had it, too
                 if name in missing and store.put(source.content(image)) != name:
-                    raise _rejection(source, [RejectedFile(image, Reason(ImportProblem.OTHER_IMAGE))])
+                    raise _rejection(source, [RejectedFile(image, ImportProblem.OTHER_IMAGE, OTHER_IMAGE)])
             if plan.wanted:
                 new = _add(transaction, target, plan, label)
                 details = {"origin": source.origin, "objects": plan.names, "views": plan.views}

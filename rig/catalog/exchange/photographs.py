@@ -8,17 +8,17 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from unicodedata import normalize
 
 from hbr.core.angles import wrap360
-from rig.catalog.exchange.tables import ANGLES, TABLE, parse_region
+from rig.catalog.exchange.tables import TABLE, parse_region
 from rig.catalog.facts import Enrollment, Session, View
-from rig.catalog.incoming import ImportProblem, Reason, RejectedFile
-from rig.catalog.records import Provenance, check_text, clean_name, this_software
+from rig.catalog.incoming import ImportProblem, RejectedFile
+from rig.catalog.records import Provenance, check_text, clean_name
 from rig.catalog.transfer import TransferItem
 from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do, NextStep
@@ -64,20 +64,20 @@ class Photographs:
         """Add a view of the object of a row, if its name and texts can be stored, and no view has its azimuth."""
         try:
             name = clean_name(row["object"])
-            for what in ("label", "note", "bench", "software"):
+            for what in ("label", "note"):
                 check_text(row.get(what, ""), what)
         except UsageError as error:
-            self.reject(view.image, ImportProblem.INVALID_VALUE, error=error.what.rstrip("."))
+            self.reject(view.image, ImportProblem.INVALID_VALUE, error.what.rstrip("."))
             return
         views = self._found.setdefault(name, {})
         if view.azimuth_deg in views:
             other = Path(views[view.azimuth_deg][0].image).name
-            self.reject(view.image, ImportProblem.SAME_AZIMUTH, name=name, other=other)
+            self.reject(view.image, ImportProblem.SAME_AZIMUTH, f"shows {name!r} from the same azimuth as {other}")
             return
         views[view.azimuth_deg] = view, row
 
-    def reject(self, path: str, code: ImportProblem, **values: Any) -> None:
-        self.rejected.append(RejectedFile(path, Reason(code, values)))
+    def reject(self, path: str, code: ImportProblem, reason: str) -> None:
+        self.rejected.append(RejectedFile(path, code, reason))
 
     def contains(self, path: Path) -> bool:
         """Return whether a file is really within the folder, where links lead."""
@@ -85,7 +85,7 @@ class Photographs:
 
     def nothing(self, what: str, *fix: str | NextStep) -> ImportRejected:
         """Return the error that nothing can be used."""
-        shown = [f"{file.path} {file.reason}" for file in self.rejected[:5]]
+        shown = [str(file) for file in self.rejected[:5]]
         return ImportRejected(what, next_step=fix, evidence={"rejected": shown})
 
     @property
@@ -172,22 +172,22 @@ class Photographs:
 
     def items(self) -> Iterator[TransferItem]:
         """Yield the objects in the order of the folder or the table."""
-        software = this_software()
         for name, found in self._found.items():
             enrollment = Enrollment(  # the transfer replaces the key by a digest of the images
                 key=name, object_id=0, started_utc=self.now, planned_azimuth_deg=tuple(sorted(found))
             )
-            sessions: dict[tuple[str, str, str | None], Session] = {}
+            sessions: dict[str | None, Session] = {}
             texts = {"label": "", "note": ""}
             for index, (azimuth_deg, (view, row)) in enumerate(sorted(found.items(), key=itemgetter(0))):
                 table = self.empty_table(name, azimuth_deg)
-                by = (row.get("bench", ""), row.get("software") or software, table)
-                if by not in sessions:
-                    provenance = Provenance(by[0], {}, {"imported_from": self.origin}, by[1])
-                    sessions[by] = Session(
-                        number=len(sessions), started_utc=self.now, provenance=provenance, empty_table=table
+                if table not in sessions:
+                    sessions[table] = Session(
+                        number=len(sessions),
+                        started_utc=self.now,
+                        provenance=Provenance("", {}, {"imported_from": self.origin}),
+                        empty_table=table,
                     )
-                view.index, view.session = index, sessions[by].number
+                view.index, view.session = index, sessions[table].number
                 enrollment.views.append(view)
                 texts = {key: text or row.get(key, "") for key, text in texts.items()}
             enrollment.sessions.extend(sessions.values())
@@ -237,11 +237,11 @@ def read_folder(
             continue
         shown = path.relative_to(folder)
         if not path.is_file():
-            photographs.reject(str(shown), ImportProblem.NOT_A_FILE)
+            photographs.reject(str(shown), ImportProblem.NOT_A_FILE, "is not a file")
         elif not photographs.contains(path):
-            photographs.reject(str(shown), ImportProblem.LINK_OUTSIDE)
+            photographs.reject(str(shown), ImportProblem.LINK_OUTSIDE, "is a link to a file outside the folder")
         elif (found := named.fullmatch(shown.with_suffix("").as_posix())) is None:
-            photographs.reject(str(shown), ImportProblem.NAME_PATTERN, pattern=pattern)
+            photographs.reject(str(shown), ImportProblem.NAME_PATTERN, f"does not match the pattern {pattern}")
         else:
             matches.append((found["object"], float(found["angle"]), path))
     if not matches:
@@ -256,9 +256,10 @@ def read_folder(
 
 
 def read_table(path: Path, *, now: datetime) -> Photographs:
-    """Read a CSV file with one row per view: ``object``, ``azimuth_deg``, ``image`` (a relative path) and more.
+    """Read a CSV file with one row per view: ``object``, ``azimuth_deg``, ``image`` (a relative path).
 
-    Unknown columns are ignored. A row that cannot be used is rejected; the others are imported.
+    ``label``, ``note`` and ``region`` are used if they are there, and other columns are ignored. A row that cannot be
+    used is rejected; the others are imported.
 
     Raises `ImportRejected`: the file is not such a table.
     """
@@ -269,7 +270,7 @@ def read_table(path: Path, *, now: datetime) -> Photographs:
             photographs.add(row, _view(photographs, row))
             used += 1
         except (ValueError, OverflowError, OSError) as error:
-            photographs.reject(f"{path.name}, line {line}", ImportProblem.INVALID_VALUE, error=str(error))
+            photographs.reject(f"{path.name}, line {line}", ImportProblem.INVALID_VALUE, str(error))
     if not used:
         raise photographs.nothing(f"{path} has no row that can be used.", "Fix the listed rows, or add one per view.")
     return photographs
@@ -303,16 +304,8 @@ def _view(photographs: Photographs, row: _Row) -> View:
         raise ValueError(f"there is no image {row['image']}")
     azimuth_deg = wrap360(_number(row["azimuth_deg"], "azimuth_deg"))
     view = View(index=0, azimuth_deg=azimuth_deg, image=str(path), region=parse_region(row.get("region", "")))
-    for name in ANGLES:
-        if row.get(name):
-            setattr(view, name, _number(row[name], name))
     if view.problem:
         raise ValueError(view.problem)
-    if row.get("captured_utc"):
-        time = datetime.fromisoformat(row["captured_utc"])
-        if time.tzinfo is None:
-            raise ValueError(f"captured_utc {row['captured_utc']} has no time zone")
-        view.captured_utc = time.astimezone(UTC)
     return view
 
 

@@ -30,11 +30,10 @@ from rig.views.description import PAPER_DESCRIPTOR
 TABLE: Final = "views.csv"
 """The table beside the photographs of an export."""
 
-ANGLES: Final = ("commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
-"""Columns that a photograph of another program does not have."""
+_ANGLES: Final = ("azimuth_deg", "commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
 VIEWS: Final[Mapping[str, type]] = {
     **dict.fromkeys(("object", "label", "note"), str),
-    **dict.fromkeys(("azimuth_deg", *ANGLES), float),
+    **dict.fromkeys(_ANGLES, float),
     "captured_utc": datetime,
     **dict.fromkeys(("bench", "software", "devices", "conditions", "evidence"), str),
     **dict.fromkeys(("image", "image_sha256", "region", "descriptor"), str),
@@ -184,7 +183,7 @@ def _rows(source: CatalogSource, item: TransferItem) -> Iterator[tuple[dict[str,
             "object": item.name,
             "label": item.label,
             "note": item.note,
-            **{name: getattr(view, name) for name in ("azimuth_deg", *ANGLES, "captured_utc")},
+            **{name: getattr(view, name) for name in (*_ANGLES, "captured_utc")},
             "bench": by.bench,
             "software": by.software,
             "devices": json.dumps(by.devices, ensure_ascii=False),

@@ -2,7 +2,6 @@
 
 import sys
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -111,8 +110,7 @@ def import_(
         lines.append("Whole photographs are described: view.roi is only for the frames of the bench.")
     for title, names in (("Enrolled again", done.replaced), ("Skipped, already in the catalog", done.skipped)):
         lines += [f"{title}: {', '.join(names[:SHOWN])}"] if names else []
-    values = {**plain(replace(done, rejected=())), "rejected": [file.as_json() for file in done.rejected]}
-    settings.say("\n".join(lines), {"dry_run": dry_run, "seconds": round(seconds, 3), **values})
+    settings.say("\n".join(lines), {"dry_run": dry_run, "seconds": round(seconds, 3), **plain(done)})
     if done.rejected:
         shown = [f"  {file.path}: {file.reason}" for file in done.rejected[:SHOWN]]
         more = len(done.rejected) - SHOWN

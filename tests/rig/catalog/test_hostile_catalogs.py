@@ -2,7 +2,6 @@
 
 import os
 import random
-import shlex
 import shutil
 import sqlite3
 import stat
@@ -232,7 +231,7 @@ def test_files_of_sqlite_are_regular_files_with_one_name(root: Path, outside: Pa
         opened(root)
 
 
-def rollback_journal(database: Path, *, names: Path | None) -> bytes:
+def rollback_journal(database: Path, *, names: Path) -> bytes:
     """Return a journal that SQLite plays back. It changes no page, and ``names`` a file that SQLite then deletes."""
     magic = bytes.fromhex("d9d505f920a163d7")
     content = database.read_bytes()
@@ -241,17 +240,11 @@ def rollback_journal(database: Path, *, names: Path | None) -> bytes:
     checksum = sum(page[at] for at in range(page_size - 200, 0, -200))
     header = magic + struct.pack(">5I", 1, 0, len(content) // page_size, 512, page_size)
     made = header.ljust(512, b"\0") + struct.pack(">I", 1) + page + struct.pack(">I", checksum)
-    if names is None:
-        return made
     name = os.fsencode(names)
     return made + struct.pack(">I", 2**30 // page_size + 1) + name + struct.pack(">2I", len(name), sum(name)) + magic
 
 
-COMMANDS = (
-    *("catalog gc --yes", "catalog verify", "catalog delete mug --yes", "catalog rename mug cup"),
-    *("catalog label mug lab", "import photographs --jobs 1"),
-    *("enroll cup --views 4", "import other --jobs 1", "export a.zip", "catalog list", "identify"),
-)
+COMMANDS = ("catalog gc --yes", "catalog verify", "enroll cup --views 4", "import other --jobs 1", "export a.zip")
 
 
 @pytest.mark.parametrize("mode", ["wal", "delete"])
@@ -269,7 +262,7 @@ def test_journal_that_names_a_file_is_not_played_back(
     before = content(root)
     result = rig(*command.split())
     assert result.exit_code == 7
-    assert "SQLite would delete the file" in result.stderr
+    assert "is a journal of another program" in " ".join(result.stderr.split())
     assert "exported bundle" in result.stderr
     assert precious.read_bytes() == SECRET
     assert content(root) == before
@@ -280,37 +273,6 @@ def test_empty_database_with_a_journal_is_not_used(root: Path, outside: Path) ->
     (root / "catalog.sqlite").write_bytes(b"")
     with pytest.raises(CatalogDamaged, match="journal of another program"):
         Catalog.open(root, clock=VirtualClock())
-
-
-@pytest.mark.parametrize("mode", ["wal", "delete"])
-def test_journal_of_another_program_is_not_played_back_unasked(root: Path, tmp_path: Path, mode: str) -> None:
-    """The other program was killed while it changed the catalog; the next step finishes its change."""
-    expected = reported(root)
-    sql(root, "PRAGMA journal_mode = delete")
-    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
-        for statement in (
-            "PRAGMA cache_size = 1",
-            "BEGIN",
-            "DROP TRIGGER views_no_update",
-            "UPDATE views SET azimuth_deg = 1",
-            "DELETE FROM derived",
-        ):
-            connection.execute(statement)
-        killed = Path(shutil.copytree(root, tmp_path / "folder"))
-    if mode == "wal":
-        sql(root, "PRAGMA journal_mode = wal")
-        (root / "catalog.sqlite-journal").write_bytes(rollback_journal(root / "catalog.sqlite", names=None))
-        killed = root
-    before = content(killed)
-    for read_only in (True, False):
-        with pytest.raises(CatalogDamaged, match="another program") as error:
-            Catalog.open(killed, clock=VirtualClock(), read_only=read_only)
-    assert content(killed) == before
-    program, file, statement = shlex.split(error.value.next_step.partition("finish its change: ")[2])
-    assert program == "sqlite3"
-    with closing(sqlite3.connect(file)) as connection:
-        connection.execute(statement).fetchall()
-    assert reported(killed) == expected
 
 
 def test_catalog_that_is_opened_for_writing_has_a_write_ahead_log(root: Path) -> None:

@@ -64,29 +64,15 @@ def table_rows(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(path.read_text())))
 
 
-def test_folder_round_trip_keeps_views_images_and_angles(
-    full: Catalog, open_catalog: OpenCatalog, tmp_path: Path
-) -> None:
+def test_folder_round_trip_keeps_views_and_images(full: Catalog, open_catalog: OpenCatalog, tmp_path: Path) -> None:
     assert write_folder(tmp_path / "old", CatalogSource(full)) == 2
     copy = open_catalog("copy")
     run_import(copy, read_table(tmp_path / "old" / "views.csv", now=NOW))
     assert model(copy) == model(full)
     assert pictures(copy) == pictures(full)
     assert copy.object("mug-white").summary.note == NOTE
-    for name in ("mug-white", "Tässe =2+2"):
-        for ours, theirs in zip(copy.object(name).views, full.object(name).views, strict=True):
-            assert (ours.encoder_deg, ours.captured_utc) == (theirs.encoder_deg, theirs.captured_utc)
-        (session,) = copy.object(name).enrollments[0].enrollment.sessions
-        assert session.provenance.bench == "bench-1"
+    assert copy.object("mug-white").views[0].region == REGION
     assert finished(verify(copy)).findings == ()
-    write_folder(tmp_path / "new", CatalogSource(copy))
-    changed = ("devices", "conditions", "evidence")  # a table of photographs has none
-    tables = [table_rows(tmp_path / name / "views.csv") for name in ("old", "new")]
-    before, after = ([{key: row[key] for key in row if key not in changed} for row in rows] for rows in tables)
-    assert before == after
-    assert len(before) == 6
-    for path in (tmp_path / "old").glob("*.png"):
-        assert path.read_bytes() == (tmp_path / "new" / path.name).read_bytes()
 
 
 def test_images_of_a_folder_are_named_as_in_coil_100(full: Catalog, open_catalog: OpenCatalog, tmp_path: Path) -> None:
