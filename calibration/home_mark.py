@@ -20,8 +20,7 @@ from calibration.table_axis import first_axis, pose
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.config import MarkConfig
-from rig.views.charuco_board import BoardDetection, CharucoBoard
-from rig.views.home_mark import mark_angle_deg
+from rig.views.charuco_board import BoardDetection, CharucoBoard, mark_angle_deg
 
 NAME: Final = "table.mark"
 STAND: Final = {"home-mark": "at the fixed place of the home mark, facing the camera while the table is at home"}

@@ -5,7 +5,6 @@ and it can be copied again without harm. An image is complete under its name or 
 """
 
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -44,19 +43,22 @@ def path_of(name: str) -> str:
     return f"{FOLDER}/{name[:2]}/{name}"
 
 
-class Images(ABC):
-    """The images of a catalog. It can be sent to other processes.
+class Images:
+    """The images of a catalog, in a folder of this computer or in a shared one. It can be sent to other processes.
 
     Every method raises an `OSError` with the reason if it fails, and `CatalogUnavailable` if a store does not answer.
     """
 
-    @abstractmethod
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
     def where(self, name: str) -> str:
         """Return the place of an image for messages; of all images for an empty name."""
+        return str(self.root / (path_of(name) if name else FOLDER))
 
-    @abstractmethod
     def read(self, name: str) -> bytes:
         """Return the bytes under a name, unchecked."""
+        return files.read_file(self.file(name))
 
     def content(self, name: str) -> bytes:
         """Return the bytes of an image.
@@ -85,66 +87,15 @@ class Images(ABC):
                 f"The image {self.where(name)} is not readable: {error}.", next_step=Do.VERIFY_CATALOG()
             ) from error
 
-    @abstractmethod
     def file(self, name: str) -> Path:
         """Return a file on this computer with the bytes of an image."""
+        return image_file(self.root, path_of(name))
 
-    @abstractmethod
     def put(self, content: bytes, *, settled: bool = True) -> str:
         """Store an image completely or not at all, and return its name; nothing happens if it is there already.
 
         On return it is durable if it is ``settled``; otherwise `settle` makes it durable.
         """
-
-    def settle(self, names: Iterable[str]) -> None:
-        """Wait until these images are durable; a store stores them so at once."""
-        del names
-
-    @abstractmethod
-    def names(self, *, before_s: float = inf) -> set[str]:
-        """Return the names of the files that were written before this time, in seconds since 1970."""
-
-    @abstractmethod
-    def size(self, name: str) -> int:
-        """Return the size of an image in bytes; 0 if there is none."""
-
-    def missing(self, names: Collection[str]) -> set[str]:
-        """Return which of these images are not there. The caller has just stored them."""
-        return set(names) - self.names()
-
-    @abstractmethod
-    def remove(self, names: Iterable[str]) -> None:
-        """Remove images. A missing one is no error."""
-
-    @abstractmethod
-    def mark(self) -> str | None:
-        """Return the id of the catalog that the images belong to."""
-
-    @abstractmethod
-    def set_mark(self, catalog_id: str) -> None:
-        """Store the id of the catalog that the images belong to."""
-
-    def is_empty(self) -> bool:
-        """Return whether there is nothing at all, as in a network share that is not mounted."""
-        return False
-
-
-class FolderImages(Images):
-    """The images in a folder of this computer, or in a shared folder."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-
-    def where(self, name: str) -> str:
-        return str(self.root / (path_of(name) if name else FOLDER))
-
-    def read(self, name: str) -> bytes:
-        return files.read_file(self.file(name))
-
-    def file(self, name: str) -> Path:
-        return image_file(self.root, path_of(name))
-
-    def put(self, content: bytes, *, settled: bool = True) -> str:
         name = name_of(content)
         path = self.file(name)
         stored = b""
@@ -176,6 +127,7 @@ class FolderImages(Images):
         return name
 
     def settle(self, names: Iterable[str]) -> None:
+        """Wait until these images are durable."""
         several = set(names)
         if len(several) > MAX_SINGLE_SYNCS:
             os.sync()  # one by one, thousands of small files take minutes on some disks
@@ -187,17 +139,21 @@ class FolderImages(Images):
             sync_folder(folder)
 
     def names(self, *, before_s: float = inf) -> set[str]:
+        """Return the names of the files that were written before this time, in seconds since 1970."""
         return {path.name for path in files_within(self.root / FOLDER) if path.lstat().st_mtime < before_s}
 
     def missing(self, names: Collection[str]) -> set[str]:
+        """Return which of these images are not there. The caller has just stored them."""
         return {name for name in names if not os.path.lexists(self.root / path_of(name))}
 
     def size(self, name: str) -> int:
+        """Return the size of an image in bytes; 0 if there is none."""
         with suppress(FileNotFoundError):
             return self.file(name).lstat().st_size
         return 0
 
     def remove(self, names: Iterable[str]) -> None:
+        """Remove images. A missing one is no error."""
         for name in names:
             path = self.file(name)
             path.unlink(missing_ok=True)
@@ -205,24 +161,30 @@ class FolderImages(Images):
                 path.parent.rmdir()
 
     def mark(self) -> str | None:
+        """Return the id of the catalog that the images belong to."""
         with suppress(FileNotFoundError):
             return read_local(self.root / MARK, max_bytes=100).decode()
         return None
 
     def set_mark(self, catalog_id: str) -> None:
+        """Store the id of the catalog that the images belong to."""
         self.root.mkdir(parents=True, exist_ok=True)
         write_local(self.root / MARK, catalog_id.encode(), mode=file_mode(self.root))
 
     def is_empty(self) -> bool:
+        """Return whether there is nothing at all, as in a network share that is not mounted."""
         return not self.root.is_dir() or not any(self.root.iterdir())
 
 
 class FsspecImages(Images):
-    """The images in a store that fsspec supports. A store writes an image as a whole."""
+    """The images in a store that fsspec supports. A store writes an image as a whole, and durably.
 
-    def __init__(self, url: str, cache: Path) -> None:
+    ``root`` is the folder of the images that were fetched for programs that read files.
+    """
+
+    def __init__(self, url: str, root: Path) -> None:
+        super().__init__(root)
         self.url = url.rstrip("/")
-        self._cache = cache
         self._opened: tuple[Any, str] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -238,7 +200,7 @@ class FsspecImages(Images):
             return bytes(store.cat_file(f"{root}/{path_of(name)}"))
 
     def file(self, name: str) -> Path:
-        path = image_file(self._cache, path_of(name))
+        path = super().file(name)
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             write_local(path, self.content(name), mode=0o600)
@@ -261,10 +223,19 @@ class FsspecImages(Images):
                 evidence={"error": str(error)},
             ) from error
 
+    def settle(self, names: Iterable[str]) -> None:
+        pass
+
     def names(self, *, before_s: float = inf) -> set[str]:
         with self._store() as (store, root):
             found = store.find(f"{root}/{FOLDER}", detail=True)
         return {path.rpartition("/")[2] for path, info in found.items() if _written_s(info) < before_s}
+
+    def missing(self, names: Collection[str]) -> set[str]:
+        return set(names) - self.names()
+
+    def is_empty(self) -> bool:
+        return False
 
     def size(self, name: str) -> int:
         with suppress(FileNotFoundError):
@@ -280,7 +251,7 @@ class FsspecImages(Images):
             for name in names:
                 with suppress(FileNotFoundError):
                     store.rm_file(f"{root}/{path_of(name)}")
-                (self._cache / path_of(name)).unlink(missing_ok=True)
+                (self.root / path_of(name)).unlink(missing_ok=True)
 
     def mark(self) -> str | None:
         with suppress(FileNotFoundError), self._store() as (store, root):
@@ -315,9 +286,9 @@ def open_images(place: CatalogPlace) -> Images:
     Raises `ExtraMissing`: the packages for this kind of store are not installed.
     """
     if place.images is None:
-        return FolderImages(place.path)
+        return Images(place.path)
     if "://" not in place.images or place.images.startswith("file://"):
-        return FolderImages(Path(place.images.removeprefix("file://")).expanduser().absolute())
+        return Images(Path(place.images.removeprefix("file://")).expanduser().absolute())
     try:
         import fsspec
 

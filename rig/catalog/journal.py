@@ -21,9 +21,8 @@ from sqlalchemy.orm import Session as Transaction
 
 import hbr
 from rig.catalog import derived, log, state
-from rig.catalog.catalog import Catalog
+from rig.catalog.catalog import Catalog, OpenEnrollment
 from rig.catalog.copying import Attempts, open_copy, open_or_copy
-from rig.catalog.enrolling import OpenEnrollment
 from rig.catalog.facts import Action, Enrollment, Entry
 from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.records import EnrollmentStatus, JsonObject

@@ -105,18 +105,17 @@ def check_complete(transaction: Transaction) -> None:
         )
 
 
-def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = None) -> Iterator[int]:
-    """Yield the numbers of lines that are not as they were written, or that follow missing ones, from ``first`` on."""
+def wrong_lines(transaction: Transaction) -> Iterator[int]:
+    """Yield the numbers of lines that are not as they were written, or that follow missing ones."""
     end, digest = head(transaction)
-    stop = end if last is None else last
-    for start in range(first, stop + 1, 1000):
-        numbers = range(start, min(start + 1000, stop + 1))
+    for start in range(1, end + 1, 1000):
+        numbers = range(start, min(start + 1000, end + 1))
         present = set(transaction.scalars(select(Entry.id).where(Entry.id >= numbers[0], Entry.id <= numbers[-1])))
         wrong = set(digests.wrong_lines(transaction, present))
         yield from (number for number in numbers if number in wrong or number not in present)
     newest = transaction.scalar(select(Entry.digest).where(Entry.id == end)) or ""
     beyond = transaction.scalar(select(func.max(Entry.id))) or 0
-    if last is None and (newest != digest or beyond > end):
+    if newest != digest or beyond > end:
         yield max(end, beyond)
 
 

@@ -5,9 +5,9 @@ Decision: docs/decisions/0009.
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
-from sqlalchemy import Select, delete, func, null, or_, select, true, union_all
+from sqlalchemy import delete, func, null, or_, select, true, union_all
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
@@ -49,7 +49,12 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     """
     database, store = catalog.database, catalog.database.images
     unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))
-    rows = _states(Enrollment.id, Enrollment.object_id, Named.object_name, Named.deleted).where(unused)
+    rows = (
+        select(Enrollment.id, Enrollment.object_id, Named.object_name, Named.deleted)
+        .join(Ended, Ended.enrollment_id == Enrollment.id)
+        .join(Named, Named.object_id == Enrollment.object_id)
+        .where(state.IS_STATUS, state.IS_STATE, unused)
+    )
     # An object store may need minutes: its files are listed outside of a transaction, so that no bench waits. They are
     # listed before the rows: an image whose row is committed in the meantime is named.
     with database.catalog_errors():
@@ -117,14 +122,3 @@ def _remove_rows(transaction: Transaction, ids: Collection[int]) -> None:
         transaction.execute(delete(Enrollment).where(Enrollment.id.in_(part)))
     present = select(Entry.seal).join(Enrollment, Enrollment.id == Entry.enrollment_id)
     transaction.execute(delete(Derived).where(Derived.seal.not_in(present.where(Entry.seal.is_not(None)))))
-
-
-def _states(*columns: Any) -> Select[Any]:
-    """Return a query of enrollments with their status, and the state of their objects."""
-    return (
-        select(*columns)
-        .select_from(Enrollment)
-        .join(Ended, Ended.enrollment_id == Enrollment.id)
-        .join(Named, Named.object_id == Enrollment.object_id)
-        .where(state.IS_STATUS, state.IS_STATE)
-    )

@@ -4,6 +4,7 @@ Decision: docs/decisions/0009.
 """
 
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -23,8 +24,8 @@ from rig.core.errors import CatalogDamaged
 from rig.core.processes import map_in_processes
 from rig.views import image_files as files
 
-_LINES, _ENROLLMENTS = 100, 10
-"""Lines of the log and enrollments in a portion: few rows are in memory at once."""
+_ENROLLMENTS: Final = 10
+"""Enrollments in a portion: few rows are in memory at once."""
 _IMAGE: Final = NAMED_IMAGES.c
 _OWNS: Final = and_(Named.object_id == Enrollment.object_id, state.IS_STATE)
 _STATUS: Final = and_(Ended.enrollment_id == Enrollment.id, state.IS_STATUS)
@@ -128,19 +129,17 @@ def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgres
 
 
 def _row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Iterator[CatalogFinding]]]:
-    """Yield the checks of portions of the log and of the enrollments."""
-    last = transaction.scalar(select(func.max(Entry.id))) or 0
+    """Yield the checks of the log and of portions of the enrollments."""
     ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
-    for first in range(1, last + 1, _LINES):
-        yield partial(_lines, first, min(first + _LINES - 1, last))
-    yield partial(_lines, last + 1, None)  # the lines since then, and the end of the log
-    yield from (_end, _missing)
+    yield from (_lines, _end, _missing)
     yield from (partial(_enrollments, part) for part in portions(ids, _ENROLLMENTS))
 
 
-def _lines(first: int, last: int | None, transaction: Transaction) -> Iterator[CatalogFinding]:
-    for number in log.wrong_lines(transaction, first, last):
-        name = transaction.scalar(select(Entry.object_name).where(Entry.id == number))
+def _lines(transaction: Transaction) -> Iterator[CatalogFinding]:
+    for number in log.wrong_lines(transaction):
+        name = None
+        with suppress(CatalogDamaged):  # the name itself may be damaged
+            name = transaction.scalar(select(Entry.object_name).where(Entry.id == number))
         yield CatalogFinding(CatalogProblem.LOG_CHANGED, name, details={"entry_id": number})
 
 

@@ -17,8 +17,7 @@ from rig.plans.jog import jog as jog_table
 from rig.plans.operator import Choice, Question, Subject
 from rig.plans.steps import announced, moved
 from rig.safety.angle_reference import AngleFinding, SavedAngleCheck
-from rig.views.charuco_board import CharucoBoard, detect_board
-from rig.views.home_mark import mark_angle_deg
+from rig.views.charuco_board import CharucoBoard, detect_board, mark_angle_deg
 
 DEVICES: Final = ("imu",)
 """The devices that a rotation needs besides the servo."""

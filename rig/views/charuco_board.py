@@ -1,11 +1,15 @@
-"""The calibration board: its layout, its print, and the detection of its corners."""
+"""The calibration board: layout, print, detection of its corners, and the table's angle by its home mark."""
 
 from dataclasses import dataclass
+from math import degrees
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from hbr.core.angles import wrap180
+from rig.config import MarkConfig
 
 DICTIONARY: Final = cv2.aruco.DICT_4X4_50
 
@@ -76,3 +80,31 @@ def detect_board(board: CharucoBoard, image_bgr: NDArray[np.uint8]) -> BoardDete
         np.asarray(corners, dtype=np.float64).reshape(-1, 2),
         np.asarray(marker_ids, dtype=np.int64).ravel(),
     )
+
+
+# The home mark: a small board at a fixed place of the platter
+
+FEWEST_CORNERS = 4
+"""A pose from fewer corners has several solutions."""
+ASKEW_DEG = 8.0  # larger: a card that was moved is used; smaller: a small card in noise is not
+"""Largest rotation of the card about another axis than the table's."""
+
+
+def mark_angle_deg(seen: BoardDetection, mark: MarkConfig) -> float | None:
+    """Return the table's angle within a revolution, from −180° to 180°; None if the card is not seen at its place."""
+    if seen.ids.size < FEWEST_CORNERS:
+        return None
+    fx, fy, cx, cy, *distortion = mark.camera
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    # A small plane has two poses that look nearly alike; that of the card differs from home only about the axis.
+    _, poses, _, _ = cv2.solvePnPGeneric(
+        CharucoBoard(*mark.card).points_mm()[seen.ids],
+        seen.corners_px,
+        matrix,
+        np.array(distortion),
+        flags=cv2.SOLVEPNP_IPPE,
+    )
+    home, axis = cv2.Rodrigues(np.array(mark.rotation))[0], np.array(mark.axis)
+    since_home = [cv2.Rodrigues(cv2.Rodrigues(pose)[0] @ home.T)[0].ravel() for pose in poses]
+    askew, angle = min((float(np.linalg.norm(r - r @ axis * axis)), float(r @ axis)) for r in since_home)
+    return float(wrap180(degrees(angle))) if degrees(askew) <= ASKEW_DEG else None

@@ -11,8 +11,7 @@ from calibration.procedure import Evaluation
 from rig.calibrations import CalibrationResult, CalibrationStore
 from rig.core.clock import SystemClock
 from rig.safety.saved_state import FileStore
-from rig.views.charuco_board import CharucoBoard, detect_board
-from rig.views.home_mark import mark_angle_deg
+from rig.views.charuco_board import CharucoBoard, detect_board, mark_angle_deg
 from sim.calibration_board import home_mark
 from sim.optics import Optics
 

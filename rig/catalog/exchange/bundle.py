@@ -24,7 +24,7 @@ from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.exchange.new_files import new_file
 from rig.catalog.facts import Enrollment, Session, View
-from rig.catalog.images import FolderImages, name_of, path_of
+from rig.catalog.images import Images, name_of, path_of
 from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.config.catalog_place import DATABASE_NAME
@@ -70,7 +70,7 @@ def write_bundle(path: Path, source: CatalogSource) -> int:
     return done.objects
 
 
-class _ArchivedImages(FolderImages):
+class _ArchivedImages(Images):
     """The images of a bundle that is being written."""
 
     def __init__(self, archive: ZipFile) -> None:

@@ -22,7 +22,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.describing import described
 from rig.catalog.exchange.new_files import new_folder
 from rig.catalog.facts import Session, View
-from rig.catalog.images import FolderImages, path_of
+from rig.catalog.images import Images, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.records import Region, this_software
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
@@ -138,7 +138,7 @@ def _masks(folder: Path, portion: tuple[_Picture, ...]) -> list[_Mask]:
 
 
 def _mask(folder: Path, picture: _Picture) -> _Mask:
-    image = FolderImages(folder).pixels(picture.view.image)
+    image = Images(folder).pixels(picture.view.image)
     describer = _describer(folder, picture.view.region, picture.session.empty_table)
     found = describer.segment(image, picture.view.azimuth_deg, json.loads(picture.segmentation))
     height, width = image.shape[:2]
@@ -157,7 +157,7 @@ def _mask(folder: Path, picture: _Picture) -> _Mask:
 
 @lru_cache(maxsize=4)
 def _describer(folder: Path, region: Region | None, empty_table: str | None) -> ViewDescriber:
-    table = None if empty_table is None else FolderImages(folder).pixels(empty_table)
+    table = None if empty_table is None else Images(folder).pixels(empty_table)
     return ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), table)
 
 

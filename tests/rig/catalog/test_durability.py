@@ -15,7 +15,7 @@ from sqlalchemy import Engine, event
 
 from rig.catalog import Catalog, OpenEnrollment
 from rig.catalog.derived import views as searched
-from rig.catalog.images import FolderImages, name_of
+from rig.catalog.images import Images, name_of
 from rig.catalog.jobs import finished
 from rig.catalog.sqlite_database import SqliteDatabase
 from rig.catalog.upkeep import collect_garbage
@@ -204,7 +204,7 @@ def test_several_processes_share_one_catalog(tmp_path: Path) -> None:
 def test_processes_that_store_the_same_image_do_not_disturb_each_other(tmp_path: Path) -> None:
     """All sessions of a bench store the same empty-table image."""
     contents = [encode(image(seed)) for seed in range(30)]
-    store = FolderImages(tmp_path)
+    store = Images(tmp_path)
     children = []
     for _ in range(3):
         if (child := os.fork()) == 0:
@@ -232,15 +232,15 @@ def test_an_image_that_is_collected_before_its_row_is_stored_again(
         fill(catalog, "gone", 1)
         catalog.delete("gone")
         enrollment = begin(catalog, "mug", 1)
-        put = FolderImages.put
+        put = Images.put
 
-        def put_and_collect(store: FolderImages, content: bytes, *, settled: bool = True) -> str:
+        def put_and_collect(store: Images, content: bytes, *, settled: bool = True) -> str:
             name = put(store, content, settled=settled)
-            monkeypatch.setattr(FolderImages, "put", put)
+            monkeypatch.setattr(Images, "put", put)
             assert collect_garbage(other).files == 1
             return name
 
-        monkeypatch.setattr(FolderImages, "put", put_and_collect)
+        monkeypatch.setattr(Images, "put", put_and_collect)
         enrollment.add(record(0), image(0))
         enrollment.finish()
         assert np.array_equal(catalog.read_image(catalog.object("mug").views[0].image), image(0))

@@ -473,7 +473,7 @@ SHOWN: dict[str, Callable[[Catalog], Any]] = {
                 one.name,
                 one.label,
                 one.note,
-                [(e.status, e.enrollment.planned_azimuth_deg, e.enrollment.views) for e in one.enrollments],
+                (one.enrollment.planned_azimuth_deg, one.enrollment.views),
             )
             for one in CatalogSource(catalog).items()
         ]
@@ -541,7 +541,7 @@ def reported(root: Path) -> Any:
             ascii([item.views for item in details]),
             (loaded.descriptors.tolist(), loaded.azimuth_deg.tolist(), loaded.object_names, catalog.version()),
             ascii(catalog.log()),
-            ascii([(item.name, item.label, item.keys) for item in CatalogSource(catalog).items()]),
+            ascii([(item.name, item.label, item.enrollment.key) for item in CatalogSource(catalog).items()]),
             find_results(catalog),
         )
 

@@ -1,17 +1,12 @@
 """Verify a catalog, and describe its views again."""
 
-import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hbr.descriptors import descriptor, registry
-from hbr.descriptors.cedd import Cedd
 from rig.catalog import Catalog, derived
-from rig.catalog.jobs import JobProgress
 from rig.catalog.verify import CatalogFinding, CatalogProblem, CatalogVerification, verify
-from rig.core.errors import CatalogError, UsageError
 from rig.views.description import BENCH_DESCRIPTOR
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
@@ -19,7 +14,6 @@ from tests.rig.catalog.catalog_samples import (
     files,
     fill,
     finished,
-    forget,
     image,
     plan,
     sql,
@@ -61,26 +55,6 @@ class TestVerify:
             f"image missing: 'mug': {finding.path}; No such file or directory; "
             "restore it from a backup, or enroll the object again"
         )
-
-    def test_swapped_images_and_links_are_found(self, catalog: Catalog, tmp_path: Path) -> None:
-        first, second, third = self.images(catalog, "mug")
-        a, b = first.read_bytes(), second.read_bytes()
-        first.write_bytes(b)
-        second.write_bytes(a)
-        third.rename(tmp_path / "outside.png")
-        third.symlink_to(tmp_path / "outside.png")
-        found = finished(verify(catalog, jobs=1))
-        assert concerned(found) == [
-            (CatalogProblem.CHANGED_IMAGE, "mug"),
-            (CatalogProblem.CHANGED_IMAGE, "mug"),
-            (CatalogProblem.MISSING_IMAGE, "mug"),
-        ]
-        assert "leads to another place" in found.findings[2].details["reason"]
-
-    @pytest.mark.parametrize("damage", [b"", b"\x89PNG\r\n\x1a\n", b"x" * 5000])
-    def test_damaged_image_is_found(self, catalog: Catalog, damage: bytes) -> None:
-        self.images(catalog, "tin")[2].write_bytes(damage)
-        assert concerned(finished(verify(catalog))) == [(CatalogProblem.CHANGED_IMAGE, "tin")]
 
     @pytest.mark.sqlite
     @pytest.mark.parametrize(
@@ -176,40 +150,3 @@ def test_every_problem_has_words_and_a_next_step(problem: CatalogProblem) -> Non
         words = CatalogFinding(problem, name, None, None, details).text
         assert words.startswith(f"{problem}")
         assert words.count("; ") == 2
-
-
-class TestDescribe:
-    def test_new_version_of_a_descriptor_is_computed(self, catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-        fill(catalog, "mug", 3, 0)
-        fill(catalog, "tin", 2, 10)
-        monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
-        assert list(derived.load_views(catalog, "cedd")) == [JobProgress(done, 2) for done in (0, 1, 2)]
-        assert len(derived.views(catalog)) == 5
-        assert list(derived.load_views(catalog, "cedd")) == []
-
-    def test_another_descriptor_is_added(self, catalog: Catalog) -> None:
-        fill(catalog, "mug", 3, 0, REGION)
-        wanted = descriptor("cedd-blurred").describe(np.ascontiguousarray(image(1)[:, 4:28]))
-        assert np.array_equal(derived.views(catalog, "cedd-blurred").descriptors[1], wanted)
-        fill(catalog, "tin", 2, 10)
-        assert len(derived.views(catalog, "cedd-blurred")) == 5  # the missing ones are computed
-        with pytest.raises(UsageError, match="sift"):
-            derived.views(catalog, "sift")
-
-    def test_interrupted_job_continues(self, catalog: Catalog) -> None:
-        for number in range(3):
-            fill(catalog, f"mug-{number}", 2, 10 * number)
-        forget(catalog)
-        job = derived.load_views(catalog, "cedd")
-        assert list(itertools.islice(job, 2)) == [JobProgress(0, 3), JobProgress(1, 3)]
-        job.close()
-        assert next(derived.load_views(catalog, "cedd")) == JobProgress(0, 2)
-
-    def test_missing_image_fails_its_object(self, catalog: Catalog) -> None:
-        fill(catalog, "mug", 3, 0)
-        fill(catalog, "tin", 2, 10)
-        catalog.image_path(catalog.object("mug").views[1].image).unlink()
-        forget(catalog)
-        with pytest.raises(CatalogError, match=r"'mug' cannot be described.*missing"):
-            derived.views(catalog)
-        assert next(derived.load_views(catalog, "cedd")) == JobProgress(0, 1)  # the other one is described

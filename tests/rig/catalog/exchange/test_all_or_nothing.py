@@ -41,7 +41,7 @@ class TestAllOrNothing:
         assert run_import(catalog, photographs()).views == 12
         assert finished(verify(catalog)).findings == ()
 
-    @pytest.mark.parametrize("step", ["rig.catalog.images.FolderImages.settle", "rig.catalog.log.append"])
+    @pytest.mark.parametrize("step", ["rig.catalog.images.Images.settle", "rig.catalog.log.append"])
     @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
     def test_import_that_fails_at_its_end_leaves_no_object(
         self,
@@ -70,7 +70,7 @@ class TestAllOrNothing:
             raise OSError(28, "No space left on device")
 
         catalog = open_catalog("catalog")
-        monkeypatch.setattr("rig.catalog.images.FolderImages.put", full)
+        monkeypatch.setattr("rig.catalog.images.Images.put", full)
         with pytest.raises(CatalogError, match="is full"):
             run_import(catalog, photographs())
         assert untouched(catalog)

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from rig.catalog import Catalog
 from rig.catalog.facts import Derived
-from rig.catalog.images import FolderImages
+from rig.catalog.images import Images
 from rig.cli.main import app
 from rig.cli.ui.exit_codes import EXIT_QUALITY, EXIT_UNKNOWN
 from rig.core.clock import SystemClock
@@ -115,7 +115,7 @@ def test_answer_is_printed_even_if_it_cannot_be_recorded(rig, monkeypatch):
     def fail(*_: object, **__: object) -> str:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(FolderImages, "put", fail)
+    monkeypatch.setattr(Images, "put", fail)
     done = rig("identify", "--sample", "S-1", "--set", "bench.sim.object=dice")
     assert done.exit_code == 0
     answer, warning = done.stdout.index("dice, rotated"), done.stdout.index("Warning: the answer is not recorded")
