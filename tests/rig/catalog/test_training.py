@@ -1,8 +1,7 @@
 """Training sets: COCO and YOLO with masks of the objects, divided into parts, and imported without loss."""
 
 import json
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from rig.catalog.verify import verify
 from rig.cli.main import app
 from rig.core.errors import ExportFailed
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, sql, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, without_waiting
 
 REGION = (16, 0, 160, 144)
 VIEWS = 4
@@ -199,56 +198,3 @@ def test_catalog_without_complete_enrollments_gives_no_training_set(tmp_path: Pa
         with pytest.raises(ExportFailed, match="no complete enrollments"):
             export(empty, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def remove_catalog(folder: Path) -> None:
-    (folder / "catalog.sqlite").unlink()
-
-
-def change_name(folder: Path) -> None:
-    sql(folder, "UPDATE log SET object_name = 'jug' WHERE object_name = 'mug'")
-
-
-def link_image(folder: Path) -> None:
-    image = next((folder / "images").rglob("*.png"))
-    image.rename(folder.parent / "elsewhere.png")
-    image.symlink_to(folder.parent / "elsewhere.png")
-
-
-def remove_image(folder: Path) -> None:
-    next((folder / "images").rglob("*.png")).unlink()
-
-
-def link_images(folder: Path) -> None:
-    (folder / "images").rename(folder.parent / "elsewhere")
-    (folder / "images").symlink_to(folder.parent / "elsewhere")
-
-
-@pytest.mark.parametrize("spoil", [remove_catalog, change_name, remove_image, link_image, link_images])
-def test_damaged_training_set_is_not_imported(catalog: Catalog, tmp_path: Path, spoil: Callable[[Path], None]) -> None:
-    export(catalog, tmp_path / "out")
-    spoil(tmp_path / "out")
-    done = import_(tmp_path / "out", tmp_path / "new")
-    assert isinstance(done.exception, SystemExit)
-    assert done.exit_code > 0
-    assert nothing_in(tmp_path / "new")
-
-
-def test_image_that_was_changed_is_not_imported(catalog: Catalog, tmp_path: Path) -> None:
-    export(catalog, tmp_path / "out")
-    one, other = sorted((tmp_path / "out" / "images").rglob("*.png"))[:2]
-    size = one.stat().st_size
-    shutil.copy(other, one)
-    with one.open("r+b") as file:
-        file.truncate(size)
-    done = import_(tmp_path / "out", tmp_path / "new")
-    assert isinstance(done.exception, SystemExit)
-    assert done.exit_code > 0
-    assert nothing_in(tmp_path / "new")
-
-
-def nothing_in(folder: Path) -> bool:
-    if not (folder / "catalog.sqlite").exists():
-        return True
-    with Catalog.open(folder, clock=VirtualClock()) as catalog:
-        return catalog.objects() == [] and not list(folder.rglob("*.png"))
