@@ -35,32 +35,17 @@ def check_folder(root: Path) -> None:
             found = (root / name).lstat()
             if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
                 raise _leads_out(root / name)
-    _check_rollback_journal(root)
-
-
-def _check_rollback_journal(root: Path) -> None:
-    """Raise `CatalogDamaged` if there is a rollback journal.
-
-    SQLite plays it back before this program can look at anything. A journal with a super-journal record names any other
-    file, and SQLite then deletes that file. This program leaves no such journal after a kill: it writes with a
-    write-ahead log only (`SqliteDatabase`).
-
-    The log itself (``-wal``) and its index (``-shm``) remain after a kill, and need no such check. They name no file.
-    The log contains pages of the database, which are checked like the database itself. The first program that opens
-    the database empties the index.
-    """
-    journal = root / f"{DATABASE_NAME}-journal"
-    try:
-        size = journal.lstat().st_size
-    except FileNotFoundError:
-        return
-    if size:
-        raise CatalogDamaged(
-            f"{os.fspath(journal)!r} is a journal of another program. SQLite would change the catalog by it, and "
-            "delete the file that it may name. Nothing was opened or changed.",
-            next_step=FIX,
-            evidence={"bytes": size},
-        )
+            # SQLite plays a rollback journal back before this program can look at anything. One with a super-journal
+            # record names any other file, and SQLite then deletes that file. This program leaves no such journal after
+            # a kill: it writes with a write-ahead log only. The log itself (-wal) and its index (-shm) name no file;
+            # the pages of the log are checked like the database.
+            if found.st_size and name.endswith("-journal"):
+                raise CatalogDamaged(
+                    f"{os.fspath(root / name)!r} is a journal of another program. SQLite would change the catalog by "
+                    "it, and delete the file that it may name. Nothing was opened or changed.",
+                    next_step=FIX,
+                    evidence={"bytes": found.st_size},
+                )
 
 
 def image_file(root: Path, path: str) -> Path:

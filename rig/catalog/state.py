@@ -57,7 +57,7 @@ IN_USE = and_(IS_STATE, Named.deleted == false())
 _BY_ID = select(Named).where(IS_STATE, Named.object_id == bindparam("object_id"))
 _FOLD = select(Named.id).where(IS_STATE), select(Ended.id).where(IS_STATUS)
 _USED = (
-    select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id)
+    select(Named.object_id, Named.object_name, Ended.enrollment_id, Ended.seal, Enrollment.id)
     .join(Ended, Ended.object_id == Named.object_id)
     .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
     .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
@@ -114,10 +114,7 @@ class Used:
     object_id: int
     name: str
     enrollment_id: int
-    key: str
     seal: str
-    line: int
-    """The line of the log with the seal."""
 
 
 def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
@@ -133,7 +130,7 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     if wrong := [str(row[1]) for row in rows if None in row or owners[row[0]] > 1]:
         raise changed(wrong)
     found: Sequence[Sequence[Any]] = rows
-    return [Used(*row) for row in found]
+    return [Used(*row[:4]) for row in found]
 
 
 def first_views(transaction: Transaction, *columns: Any) -> list[Any]:
@@ -455,13 +452,13 @@ def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
         )
 
 
-def check(transaction: Transaction, *conditions: ColumnElement[bool]) -> None:
-    """Raise `CatalogDamaged` if objects or enrollments, all or some, are not as they were written."""
+def check(transaction: Transaction) -> None:
+    """Raise `CatalogDamaged` if objects or enrollments are not as they were written."""
     check_fold(transaction)
     rows = transaction.execute(
         select(Enrollment.id, Ended.seal, Ended.object_id, Enrollment.object_id)
         .join(Ended, Ended.enrollment_id == Enrollment.id)
-        .where(IS_STATUS, *conditions)
+        .where(IS_STATUS)
     ).all()
     owner = {row[0]: row[2] for row in rows}
     wrong = [row[2] for row in rows if row[2] != row[3]]
