@@ -17,17 +17,16 @@ from rich.terminal_theme import MONOKAI
 from rich.text import Text
 
 HERE = Path(__file__).parent
-WIDTH, HEIGHT = 104, 32
-DEMO_WIDTH = 136
+WIDTH, HEIGHT = 136, 32
 STEP = re.compile(r"\x1b\[(?P<count>\d*)(?P<what>[A-Za-z])|\x1b\[\?25[hl]|(?P<break>\r?\n)|(?P<back>\r)")
 
 
-def output(folder: Path, arguments: list[str], until: str | None = None, columns: int = WIDTH) -> str:
-    """Run `rig` in a terminal and return what it printed: all, or as far as a live picture that holds ``until``."""
+def output(folder: Path, arguments: list[str]) -> str:
+    """Run `rig` in a terminal and return what it printed."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.chdir(folder)
-        os.environ |= {"COLUMNS": str(columns), "LINES": str(HEIGHT), "TERM": "xterm-256color"}
+        os.environ |= {"COLUMNS": str(WIDTH), "LINES": str(HEIGHT), "TERM": "xterm-256color"}
         code = "from rig.cli.main import main; main()"
         os.execv(sys.executable, [sys.executable, "-c", code, *arguments])
     seen = b""
@@ -41,11 +40,7 @@ def output(folder: Path, arguments: list[str], until: str | None = None, columns
         seen += part
     os.waitpid(pid, 0)
     os.close(terminal)
-    text = seen.decode(errors="replace")
-    if until is not None:
-        pictures = [found.end() for found in re.finditer(re.escape(until), text)]
-        text = text[: text.index("\x1b[2K", pictures[len(pictures) * 2 // 3])]
-    return text
+    return seen.decode(errors="replace")
 
 
 def screen(text: str) -> list[str]:
@@ -68,9 +63,9 @@ def screen(text: str) -> list[str]:
     return lines
 
 
-def picture(name: str, command: str, lines: list[str], columns: int = WIDTH) -> None:
+def picture(name: str, command: str, lines: list[str]) -> None:
     """Write ``name``.png: the command, and what stood on the screen below it."""
-    console = Console(record=True, width=columns, file=open(os.devnull, "w"), force_terminal=True)  # noqa: SIM115, PTH123
+    console = Console(record=True, width=WIDTH, file=open(os.devnull, "w"), force_terminal=True)  # noqa: SIM115, PTH123
     console.print(Text(f"$ {command}", style="bold"))
     for line in lines:
         console.print(Text.from_ansi(line))
@@ -100,19 +95,9 @@ def photograph(name: str, page: Path, width: int, height: int) -> None:
 def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "rig.toml").write_text(
-            'default_bench = "sim"\nstate_dir = "state"\n[catalog]\npath = "catalog"\n', encoding="utf-8"
-        )
-        for thing in ("mug-star", "toy-house", "book-night", "camera", "teapot"):
-            output(folder, ["enroll", thing, "--views", "36"])
-        words = ["enroll", "mug-white", "--views", "36"]
-        text = output(folder, words, until="/36")
-        picture("enroll", "rig " + " ".join(words), screen(text))
-        words = ["identify", "--set", "bench.sim.object=mug-white", "--seed", "3"]
-        picture("identify", "rig identify", [line for line in screen(output(folder, words)) if line.strip()])
-        lines = screen(output(folder, ["demo"], columns=DEMO_WIDTH))
+        lines = screen(output(folder, ["demo"]))
         enrolled = max(n for n, line in enumerate(lines) if "views enrolled in" in line)
-        picture("demo", "make demo", [*lines[:3], "...", *lines[enrolled:]], DEMO_WIDTH)
+        picture("demo", "make demo", [*lines[:3], "...", *lines[enrolled:]])
 
 
 if __name__ == "__main__":

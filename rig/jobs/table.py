@@ -1,7 +1,7 @@
 """The jobs that rotate the table, set its angle, and acknowledge a fault."""
 
 from collections.abc import Iterable
-from contextlib import closing
+from enum import Enum
 from typing import Final
 
 from rig.bench import Bench
@@ -12,8 +12,6 @@ from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import angle_words, counted, signed
 from rig.jobs.desk import Desk, JobResult, Remark, Steps
 from rig.motion.turntable import Turntable
-from rig.plans.jog import JogKey
-from rig.plans.jog import jog as jog_table
 from rig.plans.operator import Choice, Question, Subject
 from rig.plans.steps import announced, moved
 from rig.safety.angle_reference import AngleFinding, SavedAngleCheck
@@ -26,7 +24,20 @@ OTHERWISE: Final[dict[Subject, SomeSteps]] = {
     Subject.REVOLUTION: ("Otherwise leave it, and give its revolutions:", Do.SET_REVOLUTIONS(revolutions=0)),
 }
 """What the operator may do instead of an answer."""
+STEPS_DEG: Final = (0.5, 1.0, 5.0, 15.0, 45.0, 90.0)
+"""Steps of jog, from seeing whether the table moves to a quarter of a revolution."""
 LEAVE: Final = {Choice.CONTINUE: "rotate", Choice.STOP: "leave it"}
+
+
+class JogKey(Enum):
+    """The operator's keys."""
+
+    FORWARD = "forward"
+    BACK = "back"
+    LARGER_STEP = "larger-step"
+    SMALLER_STEP = "smaller-step"
+    HOME = "home"
+    END = "end"
 
 
 def goto(desk: Desk, angle_deg: float) -> Steps[None]:
@@ -105,17 +116,43 @@ def _rotated(desk: Desk, bench: Bench, angle_deg: float) -> Steps[None]:
     yield from desk.log(Action.MOVED, to_deg=angle_deg)
 
 
-def jog(desk: Desk, keys: Iterable[JogKey | None], *, step_deg: float) -> Steps[None]:
-    """Rotate the table by one step for each key, and write the last angle into the log of the catalog."""
+def jog(desk: Desk, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -> Steps[None]:
+    """Rotate the table by one step for each key, within its limits; the log of the catalog gets the last angle.
+
+    The torque is on until the job ends. The operator's ``keys`` are None several times a second while there is no key,
+    so that `rig stop` is noticed.
+
+    Raises `UsageError`: the step is not positive. Other errors are those of `Turntable.goto`.
+    """
+    if not 0 < step_deg <= 360:
+        raise UsageError(f"A step of {step_deg:g}° is not possible.", next_step="Give a step above 0° and up to 360°.")
     angle_deg = None
-    with desk.open_bench(DEVICES) as bench, closing(jog_table(bench, keys, step_deg=step_deg)) as events:
+    with desk.open_bench(DEVICES) as bench:
         try:
-            for event in events:
-                if isinstance(event, float):
-                    yield Remark(f"step {event:g}°", is_warning=False)
-                    continue
-                yield event
-                angle_deg = getattr(event, "encoder_deg", angle_deg)
+            with Turntable(bench) as table:
+                for number, key in enumerate(keys):
+                    match key:
+                        case None:
+                            bench.safety.check_stop_request()
+                            continue
+                        case JogKey.END:
+                            break
+                        case JogKey.LARGER_STEP | JogKey.SMALLER_STEP:
+                            if key is JogKey.LARGER_STEP:
+                                step_deg = min((step for step in STEPS_DEG if step > step_deg), default=step_deg)
+                            else:
+                                step_deg = max((step for step in STEPS_DEG if step < step_deg), default=step_deg)
+                            yield Remark(f"step {step_deg:g}°", is_warning=False)
+                            continue
+                        case JogKey.HOME:
+                            target_deg = 0.0
+                        case _:
+                            target_deg = table.rest_deg + (step_deg if key is JogKey.FORWARD else -step_deg)
+                    low_deg, high_deg = table.limits_deg
+                    target_deg = min(max(target_deg, low_deg), high_deg)
+                    event = moved(number, (yield from announced(number, table, target_deg, asked_deg=target_deg)))
+                    yield event
+                    angle_deg = event.encoder_deg
         except RigError as error:
             yield from desk.log(Action.MOVED, to_deg=angle_deg, ended=error.what)
             raise

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from click import Command, Context
 from sqlalchemy import text
 from typer.testing import Result
 
@@ -20,7 +19,6 @@ from rig.catalog.journal import Journal, deliver, journal_folder, waiting
 from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
 from rig.catalog.verify import CatalogProblem, verify
-from rig.cli.ui.complete import object_names
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable, ObjectExists
@@ -251,14 +249,6 @@ def test_names_of_the_server_are_known_before_the_table_is_cleared(
                 journal.check_enrollable("mug")
         finally:
             postgres.start()
-
-
-def test_completion_offers_the_names_of_the_local_copy(place: CatalogPlace, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = {"overrides": settings_of(place)}
-    monkeypatch.setattr(Catalog, "open", None)  # the server is not asked
-    context = Context(Command("enroll"))
-    context.params = given
-    assert object_names(context, "m") == ["mug"]
 
 
 def test_damage_in_the_journal_stays_there_and_is_reported(place: CatalogPlace) -> None:

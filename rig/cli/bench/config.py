@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.complete import config_keys
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError, UsageError
@@ -49,7 +48,7 @@ def show(
     settings: Settings,
     wanted: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[KEY]...", help="Keys or sections (default: all).", autocompletion=config_keys),
+        typer.Argument(metavar="[KEY]...", help="Keys or sections (default: all)."),
     ] = None,
     changed: Annotated[bool, typer.Option("--changed", help="Show only values that differ from the defaults.")] = False,
 ) -> None:
@@ -101,7 +100,7 @@ def set_(
     settings: Settings,
     key: Annotated[
         str,
-        typer.Argument(metavar="KEY", help="Key with its section, for example servo.port.", autocompletion=config_keys),
+        typer.Argument(metavar="KEY", help="Key with its section, for example servo.port."),
     ],
     value: Annotated[
         str,

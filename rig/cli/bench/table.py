@@ -1,5 +1,7 @@
 """`rig goto`, `rig home`, `rig jog`, `rig status`, `rig stop` and `rig acknowledge`."""
 
+import os
+import select
 import sys
 import termios
 import tty
@@ -13,7 +15,6 @@ import typer
 from rig.cli.bench.doctor import doctor_context
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
-from rig.cli.ui.keys import read_keys
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
@@ -21,7 +22,7 @@ from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.events.events import Event
-    from rig.plans.jog import JogKey
+    from rig.jobs.table import JogKey
 
 
 @command
@@ -138,17 +139,13 @@ def acknowledge(
 _WAIT_S: Final = 0.2
 _KEYS: Final = {
     b"\x1b[C": "forward",
-    b"\x1bOC": "forward",
     b"\x1b[D": "back",
-    b"\x1bOD": "back",
     b"\x1b[A": "larger-step",
-    b"\x1bOA": "larger-step",
     b"\x1b[B": "smaller-step",
-    b"\x1bOB": "smaller-step",
     b"h": "home",
     b"q": "end",
 }
-"""The bytes that a terminal sends for each key; cursor keys have two forms."""
+"""The bytes that a terminal sends for each key."""
 
 
 @command
@@ -195,8 +192,18 @@ def _keys_at_once() -> Iterator[None]:
 
 def _pressed(step: float) -> "Iterator[JogKey | None]":
     """Show the keys, and yield those that are pressed, or None while there is none; end with the terminal."""
-    from rig.plans.jog import JogKey
+    from rig.jobs.table import JogKey
 
     print(f"→ +{step:g}°   ← −{step:g}°   ↑ ↓ step   h home   q end   Ctrl+C stop", file=sys.stderr)
-    while (keys := read_keys(_WAIT_S)) is not None:
+    while True:
+        keys = b""
+        if select.select([sys.stdin], [], [], _WAIT_S)[0]:
+            try:
+                keys = os.read(sys.stdin.fileno(), 64)
+            except OSError:
+                keys = b""
+            if not keys:  # the terminal is gone
+                return
+        # in the other mode of the cursor keys, O replaces the bracket
+        keys = keys.replace(b"\x1bO", b"\x1b[")
         yield next((JogKey(name) for code, name in _KEYS.items() if keys.startswith(code)), None)

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.complete import object_names
 from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
-NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the object.", autocompletion=object_names)]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the object.")]
 
 
 @app.command("list")
@@ -199,9 +198,7 @@ def label_(
 @command
 def delete_(
     settings: Settings,
-    names: Annotated[
-        list[str], typer.Argument(metavar="NAME...", help="Names of the objects.", autocompletion=object_names)
-    ],
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of the objects.")],
     yes: YesOption = False,
 ) -> None:
     """Delete objects. `rig catalog undelete` restores them until `rig catalog gc` removes them permanently.

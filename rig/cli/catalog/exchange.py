@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.options import JobsOption
 from rig.cli.ui.settings import Settings
@@ -180,7 +179,7 @@ def export(
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="File or folder to write. It must not exist.")],
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all).", autocompletion=object_names),
+        typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all)."),
     ] = None,
     format_: Annotated[
         Literal["bundle", "folder", "csv", "json", "parquet", "coco", "yolo"] | None,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypedDict, Unp
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.complete import object_names
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
@@ -30,9 +29,7 @@ class Filters(TypedDict):
     """The options that select results."""
 
     sample: Annotated[str | None, typer.Option(metavar="ID", help="Only this sample.")]
-    name: Annotated[
-        str | None, typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names)
-    ]
+    name: Annotated[str | None, typer.Option("--object", metavar="NAME", help="Only this object.")]
     outcome: Annotated[Literal["found", "ambiguous", "unknown"] | None, typer.Option(help="Only this outcome.")]
     since: SinceOption
     before: Annotated[str | None, typer.Option(metavar="WHEN", help="Only those before this time.")]
@@ -126,9 +123,7 @@ def correct(
     settings: Settings,
     result: ResultArgument,
     reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="Why; it is stored with the correction.")],
-    name: Annotated[
-        str | None, typer.Option("--object", metavar="NAME", help="The right object.", autocompletion=object_names)
-    ] = None,
+    name: Annotated[str | None, typer.Option("--object", metavar="NAME", help="The right object.")] = None,
     unknown: Annotated[bool, typer.Option("--unknown", help="The object is not in the catalog.")] = False,
     sample: Annotated[str | None, typer.Option("--sample", metavar="ID", help="The right sample.")] = None,
     operator: Annotated[

@@ -1,20 +1,15 @@
 """`rig identify`."""
 
-import sys
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.complete import strategy_names
 from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_UNKNOWN
 from rig.cli.ui.settings import Settings
-
-if TYPE_CHECKING:
-    from rig.events.events import Event
 
 
 @command
@@ -26,7 +21,6 @@ def identify(
             metavar="NAME",
             help="Search strategy: dense, arc (dense in motion), ahbr, hbr, sweep, random, hmm or that of a plug-in "
             "(default: identify.strategy).",
-            autocompletion=strategy_names,
         ),
     ] = None,
     save_run: Annotated[
@@ -58,7 +52,7 @@ def identify(
 
     The catalog records each answer (rig results list).
 
-    p or the space bar pauses and resumes. Ctrl+Z pauses, fg resumes. Ctrl+C stops.
+    Ctrl+Z pauses after the next view, fg resumes. Ctrl+C stops.
 
     Example: rig identify --bench sim --seed 3 --strategy sweep --save-run runs/1
 
@@ -66,25 +60,12 @@ def identify(
     """
     from hbr import Outcome
     from rig.cli.ui.desk import CommandDesk
-    from rig.cli.ui.live import IdentifyView
-    from rig.cli.ui.present import console
-    from rig.events.events import Identified, Recorded, Waiting, event_dict
-    from rig.events.lines import line
+    from rig.cli.ui.live import LiveView
+    from rig.events.events import Identified
     from rig.jobs.identify import identify as identify_job
 
-    screen = console(stderr=settings.json)
-
-    def show(event: "Event") -> None:
-        if settings.json:
-            settings.print_json(event_dict(event))
-        # in a pipe, the text on stderr would only repeat the JSON
-        if isinstance(event, Recorded):
-            print(line(event), file=sys.stderr)
-        elif not settings.json or screen.is_terminal or isinstance(event, Waiting):
-            view.add(event)
-
-    desk = CommandDesk(settings)
-    with ExitStack() as beside, IdentifyView(screen, keys=not scan) as view:
+    with ExitStack() as beside, LiveView(settings) as view:
+        desk = CommandDesk(settings, view.hide)
         if watch:
             beside.enter_context(desk.background_delivery())
         job = identify_job(
@@ -96,9 +77,9 @@ def identify(
             scan=scan,
             person=operator,
             next_folder=None if save_run is None else partial(_run_folder, save_run, several=watch),
-            live=show,
+            live=view.add,
         )
-        answer = desk.run(job, show)
+        answer = desk.run(job, view.add)
     if not isinstance(answer, Identified) or answer.outcome is Outcome.UNKNOWN:
         raise typer.Exit(EXIT_UNKNOWN)
     if answer.outcome is Outcome.AMBIGUOUS:

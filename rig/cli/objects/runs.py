@@ -37,22 +37,16 @@ def replay(
     if check:
         _check(settings, saved)
         return
-    from rig.cli.ui.live import IdentifyView
-    from rig.cli.ui.present import console
-    from rig.events.events import event_dict
+    from rig.cli.ui.live import LiveView
 
-    if settings.json:
+    if not settings.json:
+        about = saved.about
+        started = str(about["started_utc"])[:16].replace("T", " ")
+        print(f"Bench {about['bench']}, {started} UTC, {counted(len(saved.views.object_names), 'enrolled object')}")
+    with saved.damage(), LiveView(settings, plain=True) as view:
         for event in saved.events():
-            settings.print_json(event_dict(event))
-        return
-    about = saved.about
-    started = str(about["started_utc"])[:16].replace("T", " ")
-    objects = counted(len(saved.views.object_names), "enrolled object")
-    print(f"Bench {about['bench']}, {started} UTC, {objects}")
-    with saved.damage(), IdentifyView(console(plain=True)) as view:
-        for event in saved.events():
-            view.show(event)
-    if saved.error:
+            view.add(event)
+    if saved.error and not settings.json:
         print(f"Error {saved.error['code']} ({saved.error['error']}): {saved.error['what']}")
 
 

@@ -8,8 +8,6 @@ from typing import Annotated, Any, TypedDict, get_args, get_type_hints
 
 import typer
 
-from rig.cli.ui.complete import bench_names
-
 COMMON: str = "Common options"
 """Panel of the help."""
 
@@ -22,7 +20,6 @@ class CommonOptions(TypedDict):
         typer.Option(
             metavar="NAME",
             help="Bench to use: hardware, sim, sim-bench or the bench of a plug-in (default: default_bench).",
-            autocompletion=bench_names,
             rich_help_panel=COMMON,
         ),
     ]

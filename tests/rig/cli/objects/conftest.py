@@ -17,14 +17,14 @@ SMALL = (
 
 @pytest.fixture(scope="session")
 def original(tmp_path_factory):
-    """Return a folder with two enrolled objects, the report of one, and a saved run."""
+    """Return a folder with two enrolled objects and a saved run."""
     folder = tmp_path_factory.mktemp("day")
     (folder / "rig.toml").write_text(SMALL, encoding="utf-8")
     outputs = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for name, words in {
-            "lamp": ["enroll", "lamp", "--label", "kitchen", "--label", "brass", "--report", "lamp.html"],
+            "lamp": ["enroll", "lamp", "--label", "kitchen", "--label", "brass"],
             "dice": ["enroll", "dice", "--json"],
             "run": [
                 "identify",

@@ -2,32 +2,51 @@
 
 import os
 import pty
+from collections.abc import Iterable
+from contextlib import nullcontext
 
 import pytest
 
+from rig.cli.ui.desk import CommandDesk
+from rig.cli.ui.settings import Settings
 from rig.core.errors import FaultLatched, MotionStopped, Stalled, UsageError
 from rig.events.events import Moved
-from rig.plans.jog import JogKey, jog
+from rig.jobs.desk import Remark, Steps
+from rig.jobs.table import JogKey
+from rig.jobs.table import jog as job
 from tests.programs import Program
 
 FORWARD, BACK, LARGER, SMALLER = JogKey.FORWARD, JogKey.BACK, JogKey.LARGER_STEP, JogKey.SMALLER_STEP
+
+
+@pytest.fixture
+def jog(rig, monkeypatch):
+    """Return a function that begins the job on a bench that is open."""
+
+    def begin(bench, keys: Iterable[JogKey | None], step_deg: float = 5.0) -> Steps[None]:
+        desk = CommandDesk(Settings())
+        monkeypatch.setattr(desk, "open_bench", lambda _: nullcontext(bench))
+        return job(desk, keys, step_deg=step_deg)
+
+    return begin
 
 
 def torque(s) -> int:
     return s.operator.devices.servo.memory["Torque Enable"]
 
 
-def test_keys_rotate_by_steps_within_the_limits(simulated):
+def test_keys_rotate_by_steps_within_the_limits(jog, simulated):
     s = simulated("table.limits_deg=[-200, 200]")
     keys = [FORWARD, None, SMALLER, BACK, LARGER, LARGER, LARGER, LARGER, FORWARD, FORWARD, FORWARD, JogKey.HOME]
     events = list(jog(s.bench, keys))
-    assert [event for event in events if isinstance(event, float)] == [1.0, 5.0, 15.0, 45.0, 90.0]
+    steps = [event.text for event in events if isinstance(event, Remark)]
+    assert steps == ["step 1°", "step 5°", "step 15°", "step 45°", "step 90°"]
     angles = [event.commanded_deg for event in events if isinstance(event, Moved)]
     assert angles == pytest.approx([5.0, 4.0, 94.0, 184.0, 200.0, 0.0], abs=0.5)
     assert torque(s) == 0
 
 
-def test_torque_is_off_after_the_end_key_a_fault_and_a_stop(simulated):
+def test_torque_is_off_after_the_end_key_a_fault_and_a_stop(jog, simulated):
     s = simulated()
     events = jog(s.bench, [FORWARD, JogKey.END, FORWARD])
     next(events)
@@ -48,7 +67,7 @@ def test_torque_is_off_after_the_end_key_a_fault_and_a_stop(simulated):
 
 
 @pytest.mark.parametrize("step_deg", [0.0, -1.0, 361.0, float("nan")])
-def test_impossible_step_is_rejected(simulated, step_deg):
+def test_impossible_step_is_rejected(jog, simulated, step_deg):
     with pytest.raises(UsageError):
         next(jog(simulated().bench, [FORWARD], step_deg=step_deg))
 
