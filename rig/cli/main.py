@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Unpack
 import typer
 from typer.core import TyperGroup
 
-from rig.cli.bench import config, doctor, head, serve, servo, setup, snapshot, table
+from rig.cli.bench import config, doctor, head, serve, servo, snapshot, table
 from rig.cli.catalog import catalog, exchange, results, upkeep  # noqa: F401 - upkeep adds its commands
 from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
@@ -167,7 +167,7 @@ app.command("stop")(table.stop)
 app.command("acknowledge")(table.acknowledge)
 app.command("doctor")(doctor.doctor)
 app.command("find")(doctor.find)
-app.command("setup")(setup.setup)
+app.command("setup")(doctor.setup)
 app.command("serve")(serve.serve)
 app.add_typer(results.app, name="results")
 app.add_typer(catalog.app, name="catalog")

@@ -50,14 +50,6 @@ class FoundCamera:
     modes: tuple[VideoMode, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceCandidate:
-    """A device that may be the servo, the IMU or the camera of the table, in words, and its settings by key."""
-
-    words: str
-    settings: dict[Key, Any]
-
-
 @dataclass
 class DeviceScan:
     """A scan of all ports, buses and cameras, and the devices found.
@@ -84,54 +76,39 @@ class DeviceScan:
         wanted: dict[Key, Any] = {}
         for what, found in self.candidates.items():
             if len(found) == 1 and not (what == "servo" and self.duplicate_ids):
-                wanted |= found[0].settings
+                wanted |= found[0]
         return wanted
 
     @property
-    def candidates(self) -> dict[str, list[DeviceCandidate]]:
-        """The devices found that the rig can use, by what they may be."""
-        servos = [
-            DeviceCandidate(
-                f"{port.path}: {found}",
-                {
-                    ("servo", "port"): port.stable or port.path,
-                    ("servo", "baud"): found.baud,
-                    ("servo", "id"): found.bus_id,
-                    ("servo", "model"): found.model,
-                },
-            )
+    def candidates(self) -> dict[str, list[dict[Key, Any]]]:
+        """The settings of each device found that the rig can use, by what it may be."""
+        servos: list[dict[Key, Any]] = [
+            {
+                ("servo", "port"): port.stable or port.path,
+                ("servo", "baud"): found.baud,
+                ("servo", "id"): found.bus_id,
+                ("servo", "model"): found.model,
+            }
             for port, found in self.servos
         ]
-        imus = [
-            DeviceCandidate(
-                str(found),
-                {
-                    ("imu", "model"): found.driver,
-                    ("imu", "bus"): _number_or(found.bus, found.bus.removeprefix("/dev/i2c-")),
-                    ("imu", "address"): found.address,
-                },
-            )
+        imus: list[dict[Key, Any]] = [
+            {
+                ("imu", "model"): found.driver,
+                ("imu", "bus"): _number_or(found.bus, found.bus.removeprefix("/dev/i2c-")),
+                ("imu", "address"): found.address,
+            }
             for found in self.imus
         ]
-        heads = [
-            DeviceCandidate(
-                f"on the rig head at {port.path}",
-                {
-                    ("imu", "connection"): "head",
-                    ("imu", "model"): model,
-                    ("head", "port"): port.stable or port.path,
-                },
-            )
+        heads: list[dict[Key, Any]] = [
+            {
+                ("imu", "connection"): "head",
+                ("imu", "model"): model,
+                ("head", "port"): port.stable or port.path,
+            }
             for port, model in self.heads
         ]
-        cameras = [
-            DeviceCandidate(f"{c.node.path}: {c.node.name}, {c.width}x{c.height}", camera_settings(c))
-            for c in self.cameras
-        ]
-        ribbons = [
-            DeviceCandidate(f"on ribbon cable {number}", {("camera", "source"): f"picamera2:{number}"})
-            for number in self.ribbons
-        ]
+        cameras = [camera_settings(one) for one in self.cameras]
+        ribbons: list[dict[Key, Any]] = [{("camera", "source"): f"picamera2:{number}"} for number in self.ribbons]
         return {"servo": servos, "IMU": imus + heads, "camera": cameras + ribbons}
 
     @property

@@ -40,9 +40,6 @@ class SingleServo:
         self.bus = DynamixelBus(ClockedPort(wire, self._clock), protocol=self.found.protocol)
         self.table: ControlTable = control_table(self.found.model, self.found.firmware)
 
-    def read(self) -> dict[str, int]:
-        return self.bus.read_table(self.found.bus_id, self.table)
-
     def set_id(self, new: int) -> None:
         """Change the id of the servo.
 

@@ -11,9 +11,6 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rig.catalog import Catalog
 from rig.config import RigConfig
 from rig.core.errors import ConfigError, RigError
@@ -26,7 +23,6 @@ from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error
 from rig.jobs.desk import JobResult, Steps
 from rig.safety.saved_state import FileStore
-from rig.views.image_files import encode
 
 
 def check_configuration(
@@ -109,13 +105,11 @@ def support_bundle(
     file: Path | None,
     bench: str | None,
     open_catalog: Callable[[], Catalog],
-    image_bgr: Callable[[], NDArray[np.uint8]] | None,
-    trace: Callable[[], bytes] | None = None,
 ) -> bytes:
     """Return a ZIP file for a person who helps without seeing the bench: findings, log, configuration and versions.
 
-    ``image_bgr`` takes an image of the camera for it, and ``trace`` records one. Passwords and tokens are masked. What
-    cannot be read is left out; the list ``missing`` in ``versions.json`` has the reason.
+    Passwords and tokens are masked. What cannot be read is left out; the list ``missing`` in ``versions.json`` has the
+    reason.
     """
 
     def log() -> bytes:
@@ -133,10 +127,6 @@ def support_bundle(
     }
     if file is not None:
         parts["rig.toml"] = lambda: str(masked(file.read_text("utf-8"))).encode()
-    if image_bgr is not None:
-        parts["camera.png"] = lambda: encode(image_bgr())
-    if trace is not None:
-        parts["trace.jsonl"] = trace
     contents: dict[str, bytes] = {"findings.json": _masked_json(findings)}
     missing: list[str] = []
     for name, read in parts.items():

@@ -14,7 +14,7 @@ from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping
 
     from pydantic import BaseModel
 
@@ -52,7 +52,7 @@ def show(
     ] = None,
     changed: Annotated[bool, typer.Option("--changed", help="Show only values that differ from the defaults.")] = False,
 ) -> None:
-    """Show every key as TOML: its value, where the value comes from, what it overrides, and a description.
+    """Show every key as TOML: its value, where the value comes from, and a description.
 
     A value comes from the defaults, a calibration, the file, or --set; each of them overrides those before it. The
     bench is not opened: a calibration counts here if it belongs to its present devices (rig calibrate show).
@@ -60,38 +60,50 @@ def show(
     Example: rig config show servo table.limits_deg
     """
     from rig.calibrations import apply_results
-    from rig.config.toml_file import stated
     from rig.config.values import search_paths
     from rig.config.wording import setting_line
 
     values, config, options = _checked(settings)
     in_force = _calibrations_in_force(settings, config)
     applied, _ = apply_results(config, in_force)
-    layers = _layers(values, settings, in_force)
+
+    def origin(info: "KeyInfo") -> str:
+        calibrated = [one.id for one in in_force if info.name in one.settings]
+        return values.origin(info.key) if not calibrated or values.origin(info.key) != "default" else calibrated[-1]
 
     def is_wanted(name: str) -> bool:
         return not wanted or any(name == one or name.startswith(f"{one}.") for one in wanted)
 
     every = list(_keys(applied, options))
     rows = [
-        (info, _masked(info, value), layers(info))
+        (info, masked({info.name: value})[info.name], origin(info))
         for info, value in every
         if is_wanted(info.name) and not (changed and value == info.default)
     ]
     if wanted and not rows and not changed:
         raise _unknown(wanted[0], [info.name for info, _ in every])
     if settings.json:
-        _print_json(settings, values, rows)
+        keys = {
+            info.name: {
+                "value": value,
+                "origin": source,
+                "default": info.default,
+                "allowed": info.allowed,
+                "unit": info.unit,
+                "description": info.description,
+            }
+            for info, value, source in rows
+        }
+        settings.print_json({"path": values.path, "keys": keys})
         return
     none = f"no file: the defaults. Looked for: {', '.join(map(str, search_paths()))}"
     print(f"# {values.path or none}")
     section = None
-    for info, value, ((origin, _), *overridden) in rows:
+    for info, value, source in rows:
         if info.key[:-1] != section:
             section = info.key[:-1]
             print(f"\n[{'.'.join(section)}]" if section else "")
-        others = ", ".join(f"{stated(info.key, other)} ({source})" for source, other in overridden)
-        print(setting_line(info, value, f"{origin}, overrides {others}" if others else ""))
+        print(setting_line(info, value, source))
 
 
 @app.command("set", context_settings={"ignore_unknown_options": True})
@@ -142,40 +154,12 @@ def set_(
     settings.say(text, {"path": target, "key": key, "changed": changed})
 
 
-def _masked(info: "KeyInfo", value: Any) -> Any:
-    return masked({info.name: value})[info.name]
-
-
 def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseModel]]":
     from rig.bench import check_config
     from rig.config.values import read_values
 
     values = read_values(settings.config, settings.overrides)
     return values, *check_config(values)
-
-
-def _print_json(
-    settings: Settings,
-    values: "Values",
-    rows: "Sequence[tuple[KeyInfo, Any, list[tuple[str, Any]]]]",
-) -> None:
-    settings.print_json(
-        {
-            "path": values.path,
-            "keys": {
-                info.name: {
-                    "value": value,
-                    "origin": origin,
-                    "overrides": [{"value": other, "origin": source} for source, other in overridden],
-                    "default": info.default,
-                    "allowed": info.allowed,
-                    "unit": info.unit,
-                    "description": info.description,
-                }
-                for info, value, ((origin, _), *overridden) in rows
-            },
-        }
-    )
 
 
 def _calibrations_in_force(settings: Settings, config: "RigConfig") -> "list[CalibrationResult]":
@@ -186,23 +170,6 @@ def _calibrations_in_force(settings: Settings, config: "RigConfig") -> "list[Cal
     mounted = apparatus(name, {part: {} for part in ("servo", "imu", "camera")}, config, {})
     found = CalibrationStore(config.calibration_path(name)).on_bench(mounted, SystemClock().utc())
     return [one.result for one in found if one.status is CalibrationStatus.IN_FORCE]
-
-
-def _layers(
-    values: "Values", settings: Settings, in_force: "Sequence[CalibrationResult]"
-) -> "Callable[[KeyInfo], list[tuple[str, Any]]]":
-    """Return a function for the sources and the values of a key: that in force, then those that it overrides."""
-    from rig.config.values import read_values
-
-    files = [values, read_values(settings.config)] if settings.overrides else [values]
-
-    def of(info: "KeyInfo") -> list[tuple[str, Any]]:
-        given = {one.origin(info.key): one for one in files if one.origin(info.key) != "default"}
-        layers = [(origin, _value(one.values, info.key)) for origin, one in given.items()]
-        layers += [(r.id, r.settings[info.name]) for r in reversed(in_force) if info.name in r.settings]
-        return [(origin, _masked(info, value)) for origin, value in (*layers, ("default", info.default))]
-
-    return of
 
 
 def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyInfo, Any]]":

@@ -1,13 +1,12 @@
-"""`rig doctor` and `rig find`, and what they share with `rig setup`: the bench to check, its findings, the progress."""
+"""`rig doctor`, `rig find` and `rig setup`: the bench to check, its devices, its findings."""
 
 import sys
-from collections import deque
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from textwrap import wrap
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final, TextIO
 
 import typer
 
@@ -16,16 +15,15 @@ from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
-from rig.core.errors import RigError, UsageError, os_errors_as
+from rig.core.errors import UsageError, os_errors_as
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
 
     from rich.console import Console
 
-    from rig.devices.camera import CameraIdentity, CameraLocks, Frame
+    from rig.config.toml_file import Key
     from rig.doctor.context import DoctorContext
-    from rig.doctor.examination import Check
     from rig.doctor.finding import Finding
 
 
@@ -39,14 +37,9 @@ def doctor(
         Path | None,
         typer.Option(
             metavar="FILE.zip",
-            help="Also write a support bundle: findings, log, configuration and versions. It has no pictures.",
+            help="Also write a support bundle: findings, log, configuration and versions.",
         ),
     ] = None,
-    picture: Annotated[bool, typer.Option("--picture", help="Add one image of the camera to the bundle.")] = False,
-    trace: Annotated[
-        bool,
-        typer.Option("--trace", help="Add what the devices send when they are opened, as rig servo record --still."),
-    ] = False,
 ) -> None:
     """Check everything that the bench needs. Print one finding per line, and a fix for each problem.
 
@@ -64,40 +57,19 @@ def doctor(
         return
     if bundle is not None:
         check_new(bundle, ".zip")
-    elif picture or trace:
-        raise UsageError(f"--{'picture' if picture else 'trace'} needs a bundle.", next_step="Add --bundle FILE.zip.")
     found = print_findings(settings)
     if bundle is not None:
-        image = (lambda: take(settings)[0].image_bgr) if picture else None
-        file = settings.config or default_path()
         packed = support_bundle(
             found["findings"],
             settings.load,
-            file,
+            settings.config or default_path(),
             settings.bench,
             partial(settings.open_catalog, read_only=True),
-            image,
-            partial(still_trace, settings) if trace else None,
         )
         write_new(bundle, packed)
         print(f"Support bundle: {bundle}. Look through it before you send it.", file=sys.stderr)
     if found["exit_code"]:
         raise typer.Exit(found["exit_code"])
-
-
-def still_trace(settings: Settings) -> bytes:
-    """Return a trace for which nothing moves; if a device fails, it ends there."""
-    from rig.cli.ui.desk import CommandDesk
-    from rig.jobs.trace import record
-
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "trace.jsonl"
-        try:
-            deque(record(CommandDesk(settings.tracing(file)), still=True), maxlen=0)
-        except RigError:
-            if not file.exists():
-                raise
-        return file.read_bytes()
 
 
 def print_findings(settings: Settings) -> dict[str, Any]:
@@ -136,15 +108,10 @@ def find(
 
     Example: rig find --bench sim
     """
-    from rig.cli.ui.present import console
     from rig.config.toml_file import with_values
-    from rig.doctor.device_scan import DeviceScan
 
-    scan = DeviceScan(both_protocols)
     with doctor_context(settings) as context:
-        context.require_free()
-        findings = show_findings(None if settings.json else console(), context, scan.checks)
-    wanted = scan.settings
+        findings, wanted = _scanned(context, None if settings.json else sys.stdout, both_protocols)
     if settings.json:
         settings.print_json(
             {
@@ -158,6 +125,78 @@ def find(
         raise typer.Exit(EXIT_DEVICE)
 
 
+@command
+def setup(settings: Settings) -> None:
+    """Find servo, IMU and camera, write them into a commented rig.toml, and run `rig doctor`.
+
+    A device is written if no other one could take its place. An existing file keeps its comments and all other
+    settings. Nothing moves.
+
+    Example: rig setup --bench sim
+    """
+    from rig.config import RigConfig, load_config
+    from rig.config.toml_file import read_text, save, stated, with_values
+    from rig.config.values import FILE_NAME, default_path
+    from rig.config.wording import blank_file
+
+    path = settings.config or default_path() or Path(FILE_NAME)
+    there = path.exists()
+    # A new file has no settings of the file in force: that may belong to another bench.
+    now = settings if there else replace(settings, config=None, search=False)
+    stored = load_config(path) if there else RigConfig()
+    with doctor_context(now) as context:
+        computer, bench = context.computer, context.bench
+        _, wanted = _scanned(context, sys.stderr if settings.json else sys.stdout)
+    if _PORT in wanted and computer.same_file(wanted[_PORT], stored.servo.port):
+        wanted[_PORT] = stored.servo.port  # keep the configured name
+    if ("imu", "address") in wanted:
+        wanted["imu", "connection"] = "i2c"
+    if computer.simulated:  # the devices in the file are real ones
+        wanted = {key: value for key, value in wanted.items() if key[-1] not in _at(stored, key[:-1]).model_fields_set}
+        if not settings.bench and not settings.json:
+            print("These devices are simulated. For the real bench: rig setup --bench hardware")
+    wanted["default_bench",] = bench
+    changes = {key: value for key, value in wanted.items() if _at(stored, key) != value}
+    new = with_values(read_text(path) if there else blank_file(RigConfig), changes)
+    if changes or not there:
+        save(path, new)
+    lines = [f"Wrote {path}:" if changes or not there else f"{path} is unchanged."]
+    lines += [f"  {'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
+    written = {".".join(key): value for key, value in changes.items()}
+    settings.say("\n".join([*lines, ""]), {"path": path, "written": bool(changes) or not there, "settings": written})
+    if code := print_findings(replace(settings))["exit_code"]:  # a copy reads the file again
+        raise typer.Exit(code)
+
+
+def _scanned(
+    context: "DoctorContext", out: "TextIO | None", both_protocols: bool = False
+) -> "tuple[list[Finding], dict[Key, Any]]":
+    """Search all ports, buses and cameras; return the findings, and the settings of the unambiguous devices."""
+    from rig.cli.ui.present import console
+    from rig.doctor.device_scan import DeviceScan
+    from rig.doctor.examination import run_checks
+
+    context.require_free()
+    scan = DeviceScan(both_protocols)
+    findings = []
+    for finding in run_checks(context, scan.checks, show_progress):
+        findings.append(finding)
+        if out is not None:
+            print_finding(console(stderr=out is sys.stderr), finding)
+    several = [what for what, found in scan.candidates.items() if len(found) > 1]
+    if several and out is not None:
+        print(f"! Several devices could be the {' or the '.join(several)}; name one in the file.", file=out)
+    return findings, scan.settings
+
+
+def _at(config: Any, key: "Key") -> Any:
+    """Return a value of a configuration, or a section of it."""
+    for part in key:
+        config = getattr(config, part)
+    return list(config) if isinstance(config, tuple) else config
+
+
+_PORT: Final = ("servo", "port")
 _TOPIC_WIDTH = 12
 _INDENT = 2 + _TOPIC_WIDTH
 
@@ -175,18 +214,6 @@ def doctor_context(settings: Settings, *, default: bool = False) -> "Iterator[Do
     name = settings.bench or config.default_bench
     with open_context(name, config, seed=settings.seed, options=options, file_options=file_options) as context:
         yield context
-
-
-def show_findings(screen: "Console | None", context: "DoctorContext", checks: "Iterable[Check]") -> "list[Finding]":
-    """Run checks, and print and return their findings; nothing is printed without a screen."""
-    from rig.doctor.examination import run_checks
-
-    findings = []
-    for finding in run_checks(context, checks, show_progress):
-        findings.append(finding)
-        if screen is not None:
-            print_finding(screen, finding)
-    return findings
 
 
 def print_finding(screen: "Console", finding: "Finding") -> None:
@@ -211,20 +238,6 @@ def show_progress(text: str) -> None:
     """Show progress at a terminal; the next line replaces it."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{neutral(text[:78])}\r", end="", file=unguarded(sys.stderr), flush=True)
-
-
-def take(settings: Settings, *, refocus: bool = False) -> "tuple[Frame, CameraIdentity, CameraLocks]":
-    """Return a frame of the configured camera, the camera, and its settings; with ``refocus`` the focus is new.
-
-    Raises `BenchBusy`: another program uses the bench. `DeviceNotFound`, `DeviceSilent`: the camera is missing, or
-    delivers no frames.
-    """
-    from rig.doctor.camera import open_camera
-
-    with doctor_context(settings) as context:
-        context.require_free()
-        with closing(open_camera(context, refocus=refocus)) as camera:
-            return camera.capture(context.computer.clock.now_ns()), camera.identity, camera.read_locks()
 
 
 def check_new(file: Path, suffix: str) -> None:

@@ -20,47 +20,10 @@ if TYPE_CHECKING:
     from rig.doctor.single_servo import SingleServo
 
 app = typer.Typer(
-    help="Show the servo's registers, change its settings, id and baud rate, and record a trace.", no_args_is_help=True
+    help="Change the settings, the id and the baud rate of the servo, and record a trace.", no_args_is_help=True
 )
 SHOWN: Final = 8
 """Differences that an error lists without --json."""
-
-
-@app.command("info")
-@command
-def info(settings: Settings) -> None:
-    """Show every register of the servo, as numbers of the e-manual. Writes nothing.
-
-    Example: rig servo info --bench sim
-    """
-    from rig.doctor.single_servo import single_servo
-
-    with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
-        values = servo.read()
-    if settings.json:
-        settings.print_json(
-            {
-                **_identity(servo),
-                "registers": {
-                    name: {
-                        "address": servo.table[name].address,
-                        "value": value,
-                        "kept_without_supply": servo.table[name].address < servo.table.ram_start,
-                    }
-                    for name, value in values.items()
-                },
-            }
-        )
-        return
-    show_progress("")
-    print(servo.found)
-    kept = None
-    for name, value in values.items():
-        register = servo.table[name]
-        if (now := register.address < servo.table.ram_start) is not kept:
-            kept = now
-            print("\nEEPROM: kept without supply" if kept else "\nRAM: lost without supply")
-        print(f"  {register.address:3d}  {name:24s}{value:12d}")
 
 
 @app.command("settings")

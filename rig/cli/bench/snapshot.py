@@ -1,20 +1,17 @@
 """`rig snapshot` and `rig empty-table`."""
 
 import sys
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from rig.cli.bench.doctor import check_new, take, write_new
+from rig.cli.bench.doctor import check_new, doctor_context, write_new
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
-from rig.core.errors import UsageError, os_errors_as
-from rig.core.files import write
+from rig.core.errors import UsageError
 from rig.core.next_steps import Do
-
-if TYPE_CHECKING:
-    pass
 
 
 @command
@@ -33,6 +30,7 @@ def snapshot(
 
     Example: rig snapshot table.png --bench sim
     """
+    from rig.doctor.camera import open_camera
     from rig.views.image_files import encode
 
     check_new(file, ".png")
@@ -40,7 +38,11 @@ def snapshot(
         raise UsageError(
             "camera.focus is a number.", next_step=("Release it first.", Do.SET_KEY(key="camera.focus", value="none"))
         )
-    frame, identity, locks = take(settings, refocus=refocus)
+    with doctor_context(settings) as context:
+        context.require_free()
+        with closing(open_camera(context, refocus=refocus)) as camera:
+            frame = camera.capture(context.computer.clock.now_ns())
+            identity, locks = camera.identity, camera.read_locks()
     write_new(file, encode(frame.image_bgr))
     size = f"{identity.width}x{identity.height}"
     report = {"file": str(file), "camera": identity, "locks": locks}
@@ -53,9 +55,6 @@ def snapshot(
 @command
 def empty_table(
     settings: Settings,
-    show: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Only write the stored image to a PNG file.")
-    ] = None,
     anyway: Annotated[
         bool,
         typer.Option("--anyway", help="Store the image although something on the table rotates: a pattern or a screw."),
@@ -68,24 +67,9 @@ def empty_table(
     the object takes an image at each azimuth of enroll.views; no check then finds a forgotten object.
 
     Example: rig empty-table --bench sim
-
-    Example: rig empty-table --show empty.png
     """
     from rig.cli.ui.desk import CommandDesk
     from rig.jobs.table_image import take_table_image
-    from rig.views.empty_table import empty_table_status
-    from rig.views.image_files import encode
 
-    if show is not None and anyway:
-        raise UsageError("--show takes no image, so --anyway has no effect.", next_step="Remove --anyway.")
-    if show is None:
-        desk = CommandDesk(settings)
-        desk.run(take_table_image(desk, anyway=anyway))
-        return
-    with settings.open_bench() as bench:
-        status = empty_table_status(bench)
-    if status.table is None:
-        raise UsageError(f"There is no image to show: {status.text}.", next_step=Do.EMPTY_TABLE())
-    with os_errors_as(UsageError, f"{show} cannot be written.", next_step="Choose another file with --show."):
-        write(show, encode(status.table.image_bgr))
-    settings.say(f"{show}: {status.text}", {"file": str(show), **status.as_json()})
+    desk = CommandDesk(settings)
+    desk.run(take_table_image(desk, anyway=anyway))

@@ -1,8 +1,8 @@
 """Questions to the operator at the terminal; a file or a pipe on standard input can answer them, too."""
 
 import sys
-from collections.abc import Callable, Sequence
-from typing import Final, TypeVar
+from collections.abc import Callable
+from typing import Final
 
 import typer
 
@@ -11,7 +11,6 @@ from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import unguarded
 from rig.core.errors import UsageError
 from rig.core.next_steps import in_words
-from rig.core.phrases import whole
 from rig.plans.operator import Choice, Question
 
 BELL: Final = "\a"
@@ -22,7 +21,6 @@ _KEYS: Final = {
     Choice.SKIP: "s",
     Choice.STOP: "q",
 }
-T = TypeVar("T")
 
 
 class TerminalOperator:
@@ -101,12 +99,12 @@ def ask_line(question: str, *, otherwise: str = "add --yes") -> str:
     return answer
 
 
-def ask_yes_no(question: str, *, default: bool = False) -> bool:
-    """Ask for yes or no; Enter takes the default."""
+def ask_yes_no(question: str) -> bool:
+    """Ask for yes or no; Enter means no."""
     while True:
-        answer = ask_line(f"{question} [{'Y/n' if default else 'y/N'}]").lower()
+        answer = ask_line(f"{question} [y/N]").lower()
         if answer in ("", "y", "yes", "n", "no"):
-            return answer[0] == "y" if answer else default
+            return answer.startswith("y")
         print("Answer y or n.", file=sys.stderr)
 
 
@@ -127,30 +125,3 @@ def confirm(question: str, *, yes: bool, settings: Settings) -> None:
     if not ask_yes_no(question):
         print("Nothing was changed.", file=sys.stderr)
         raise typer.Exit(EXIT_DECLINED)
-
-
-def ask_choice(question: str, options: Sequence[str]) -> int:
-    """Return the index of the chosen option."""
-    print(question, file=sys.stderr)
-    for number, option in enumerate(options, start=1):
-        print(f"  {number}  {option}", file=sys.stderr)
-    while True:
-        answer = ask_line(f"1–{len(options)}:")
-        if (chosen := whole(answer)) is not None and 1 <= chosen <= len(options):
-            return chosen - 1
-        print(f"Answer with a number from 1 to {len(options)}.", file=sys.stderr)
-
-
-def ask_value(question: str, default: T, parse: Callable[[str], T]) -> T:
-    """Ask for a value until ``parse`` accepts it; Enter takes the default.
-
-    ``parse`` raises `ValueError` with a sentence for the operator, such as "'abc' is not a number."
-    """
-    while True:
-        answer = ask_line(f"{question} [{default}]")
-        if not answer:
-            return default
-        try:
-            return parse(answer)
-        except ValueError as error:
-            print(error, file=sys.stderr)

@@ -88,7 +88,9 @@ def test_servo_that_keeps_its_rate_is_still_reached(monkeypatch):
         monkeypatch.setattr(type(bench.devices.servo), "baudrate", property(lambda _: 57_600))
         with pytest.raises(RequestRejected, match="1000000 baud"):
             servo.set_baud(1_000_000)
-        assert servo.read()["Baud Rate"] == 3  # the register has the new value; the servo answers at its old rate
+        assert (
+            servo.bus.read_table(servo.found.bus_id, servo.table)["Baud Rate"] == 3
+        )  # the register has the new value; the servo answers at its old rate
 
 
 def test_servo_that_answers_only_reads_can_be_changed(bench):
@@ -107,7 +109,7 @@ def test_ax_12a_is_changed_by_protocol_1(monkeypatch):
             servo.set_baud(115_200)
         with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == (4, 115_200)
-            assert servo.read()["Baud Rate"] == 16  # 2 MBd by 17
+            assert servo.bus.read_table(servo.found.bus_id, servo.table)["Baud Rate"] == 16  # 2 MBd by 17
 
 
 def test_every_driven_model_has_baud_rates():

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import signal
 from contextlib import contextmanager
 
 import pytest
@@ -11,7 +10,6 @@ from typer.testing import CliRunner
 from rig.bench.hardware import NoOptions
 from rig.cli.main import app
 from rig.config import load_config
-from tests.programs import Program
 from tests.rig.doctor.doctor_parts import unopened
 
 
@@ -50,21 +48,15 @@ def parts(home, monkeypatch):
 
 
 def test_setup_writes_a_commented_file_that_works(home):
-    done = rig("setup", "--bench", "sim", answers="360\ny\n")
+    done = rig("setup", "--bench", "sim")
     assert done.exit_code == 0, done.output
     text = (home / "rig.toml").read_text(encoding="utf-8")
     assert "# cable budget" in text
     config = load_config(home / "rig.toml")
     assert config.default_bench == "sim"
     assert config.servo.port.startswith("/dev/serial/by-id/")
-    assert config.table.limits_deg == (-360, 360)
     assert "No problems" in done.stdout
-    assert "rig goto 90" in done.stdout
     assert rig("goto", "10", "--json").exit_code == 0
-
-
-def test_second_setup_changes_and_asks_nothing(home):
-    assert rig("setup", "--bench", "sim", answers="\ny\n").exit_code == 0
     before = (home / "rig.toml").read_bytes()
     again = rig("setup")
     assert again.exit_code == 0, again.output
@@ -76,22 +68,22 @@ def test_setup_of_the_simulated_bench_keeps_the_devices_of_the_real_one(home):
     file = home / "rig.toml"
     text = 'default_bench = "sim"\n[servo]\nport = "/dev/ttyUSB3"\n[camera]\nsource = 2\n'
     file.write_text(text, encoding="utf-8")
-    done = rig("setup", "--yes")
+    done = rig("setup")
     assert done.exit_code == 0, done.output
-    assert "Bench sim, with simulated devices. For the real bench: rig setup --bench hardware" in done.stdout
+    assert "These devices are simulated. For the real bench: rig setup --bench hardware" in done.stdout
     assert file.read_text(encoding="utf-8").startswith(text)
     file.write_text(text.replace('default_bench = "sim"\n', ""), encoding="utf-8")
-    assert rig("setup", "--yes", "--bench", "sim").exit_code == 0
+    assert rig("setup", "--bench", "sim").exit_code == 0
     config = load_config(file)
     assert (config.default_bench, config.camera.source, config.servo.port) == ("sim", 2, "/dev/ttyUSB3")
 
 
 def test_new_file_belongs_to_the_bench_that_was_set_up(parts, home):
     (home / "rig.toml").write_text('default_bench = "sim"\n[table]\nvelocity_dps = 45\n', encoding="utf-8")
-    rig("setup", "--yes", "--config", "real.toml")
+    rig("setup", "--config", "real.toml")
     assert load_config(home / "real.toml").default_bench == "hardware"
     assert load_config(home / "real.toml").table.velocity_dps == 90
-    rig("setup", "--yes", "--config", "sim.toml", "--set", "default_bench=sim")
+    rig("setup", "--config", "sim.toml", "--set", "default_bench=sim")
     assert load_config(home / "sim.toml").default_bench == "sim"
 
 
@@ -102,7 +94,7 @@ def test_existing_file_keeps_comments_and_settings(parts, home):
         "limits_deg = [-400, 400] # measured\n",
         encoding="utf-8",
     )
-    done = rig("setup", "--yes")
+    done = rig("setup")
     assert file.read_text(encoding="utf-8").startswith(
         '# bench 7\n[servo]\nport = "/dev/ttyUSB0" # red dot\nid = 1  # the old one\n'
     )
@@ -111,89 +103,36 @@ def test_existing_file_keeps_comments_and_settings(parts, home):
     assert "rig servo settings --write" in done.stdout
 
 
-def test_permanent_settings_are_written_only_after_confirmation(parts, home):
-    memory = parts.devices.servo.memory
-    rig("setup", answers="n\n\ny\n")
-    assert memory["Operating Mode"] == 3
-    done = rig("setup", answers="y\n")
-    assert memory["Operating Mode"] == 4
-    assert "Written and verified." in done.stdout
-
-
-def test_setup_without_answers_is_a_usage_error(home):
-    done = rig("setup", "--bench", "sim")
-    assert done.exit_code == 2
-    assert "--yes" in done.stderr
-    assert not (home / "rig.toml").exists()
-    assert rig("setup", "--bench", "sim", answers="\nn\n").exit_code == 0  # asked, and rejected
-    assert not (home / "rig.toml").exists()
-
-
-def test_invalid_answers_are_asked_again(home):
-    done = rig("setup", "--bench", "sim", answers="far\n90\n720\nperhaps\ny\n")
-    assert done.exit_code == 0
-    assert load_config(home / "rig.toml").table.limits_deg == (-720, 720)
-    assert "'far' is not a number." in done.stderr
-    assert "one revolution or more" in done.stderr
-    assert "Answer y or n." in done.stderr
-
-
 def test_broken_file_is_rejected_and_unchanged(home):
     (home / "rig.toml").write_text("[servo\n", encoding="utf-8")
-    done = rig("setup", "--bench", "sim", "--yes")
+    done = rig("setup", "--bench", "sim")
     assert done.exit_code == 3
     assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo\n"
 
 
-def test_operator_chooses_one_of_several_servos(parts, home):
+def test_one_of_several_servos_is_not_chosen(parts, home):
     parts.add_servo(7, 1_000_000, "xm430_w350")
-    done = rig("setup", answers="3\n2\n\ny\n")
-    config = load_config(home / "rig.toml")
-    assert (config.servo.id, config.servo.baud, config.servo.model) == (7, 1_000_000, "xm430_w350"), done.output
-    (home / "rig.toml").unlink()
-    done = rig("setup", "--yes")
-    assert "2 devices could be the servo" in done.stdout
+    done = rig("setup")
+    assert "! Several devices could be the servo; name one in the file." in done.stdout
     assert "\nid =" not in (home / "rig.toml").read_text(encoding="utf-8")
 
 
 def test_servo_that_the_rig_cannot_drive_is_neither_configured_nor_changed(parts, home):
     memory = parts.devices.servo.memory
     memory["Model Number"] = 4000
-    done = rig("setup", "--yes")
+    done = rig("setup")
     assert done.exit_code == 4
     assert "YM070-210-M001, firmware 46, id 1 at 57600 baud (protocol 2.0): the rig cannot drive it" in done.stdout
-    assert load_config(home / "rig.toml").servo.model_fields_set <= {"port"}
+    assert not load_config(home / "rig.toml").servo.model_fields_set
     assert rig("servo", "settings", "--write", "--yes").exit_code == 4
     assert (memory["Operating Mode"], memory["Return Delay Time"]) == (3, 250)
-
-
-def test_operator_chooses_one_of_several_adapters(parts, home, monkeypatch):
-    monkeypatch.setattr("rig.doctor.device_scan.BAUD_RATES_1", (1_000_000,))
-    parts.devices.servo_bus.detach(parts.devices.servo)  # nothing answers: the ports cannot be told apart
-    parts.computer.serial_port("ttyUSB5", serial="OTHER")
-    done = rig("setup", answers="n\n3\n2\n\ny\n")
-    assert done.exit_code == 4
-    assert "Answer with a number from 1 to 2" in done.stderr
-    assert load_config(home / "rig.toml").servo.port.endswith("OTHER-if00-port0")
-
-
-def test_ctrl_c_leaves_the_old_file_untouched(home):
-    (home / "rig.toml").write_text('default_bench = "sim" # mine\n', encoding="utf-8")
-    process = Program("setup")
-    asked = ""
-    while "taut" not in asked:
-        asked += process.stderr.read(1)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert (home / "rig.toml").read_text(encoding="utf-8") == 'default_bench = "sim" # mine\n'
 
 
 def test_setup_json_is_one_object_per_line(home):
     done = rig("setup", "--bench", "sim", "--json")
     written, examined = (json.loads(line) for line in done.stdout.splitlines())
     assert written["written"] is True
-    assert written["settings"]["servo.id"] == 1
+    assert "servo.port" in written["settings"]
     assert examined["bad"] == 0
 
 
@@ -288,7 +227,6 @@ def test_missing_or_negative_answer_changes_nothing(parts, home):
 def test_two_servos_on_the_bus_are_rejected(parts, home):
     parts.add_servo(2, 1_000_000)
     for command in (
-        ["info"],
         ["settings", "--write", "--yes"],
         ["set-id", "3", "--yes"],
         ["set-baud", "9600", "--yes"],
@@ -296,14 +234,6 @@ def test_two_servos_on_the_bus_are_rejected(parts, home):
         done = rig("servo", *command)
         assert done.exit_code == 4, command
         assert "There are 2 servos" in done.stderr
-
-
-def test_info_shows_every_register(parts, home):
-    reported = json.loads(rig("servo", "info", "--json").stdout)
-    assert reported["registers"]["Present Input Voltage"]["value"] == 120
-    assert reported["registers"]["Operating Mode"]["kept_without_supply"] is True
-    text = rig("servo", "info").stdout
-    assert all(name in text for name in reported["registers"])
 
 
 def test_settings_are_shown_and_written_on_request(parts, home):
