@@ -35,10 +35,6 @@ _TYPER_USAGE_ERROR: Any = typer.BadParameter.__base__
 class _Commands(TyperGroup):
     """All commands. With ``--json`` an error in the arguments is also printed as JSON, as other errors are."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        _escape_help(self)
-
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         wants_json = "--json" in args
         with _usage_error(json=wants_json):
@@ -47,10 +43,7 @@ class _Commands(TyperGroup):
         return context
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands in their sections, and then the options.
-
-        The help of Typer begins with the options. It also imports Rich, which takes longer than all this.
-        """
+        """Write the commands in their sections, and then the options; the help of Typer begins with the options."""
         texts: dict[str, str] = {str(one.name): inspect.getdoc(one.callback) or "" for one in app.registered_commands}
         for group in app.registered_groups:
             texts[str(group.name)] = str(group.typer_instance.info.help) if group.typer_instance else ""
@@ -77,17 +70,6 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
 
 
-def _escape_help(command: Any) -> None:
-    """Escape brackets in the help of a command and its subcommands, or Rich takes a word such as [servo] for markup."""
-    for text_of in (command, *command.params):
-        if "[" in (getattr(text_of, "help", None) or ""):
-            from rich.markup import escape
-
-            text_of.help = escape(text_of.help)
-    for inner in getattr(command, "commands", {}).values():
-        _escape_help(inner)
-
-
 @contextmanager
 def _usage_error(*, json: bool) -> Iterator[None]:
     """Neutralise an error in the arguments, and print it as JSON; Typer prints it as text."""
@@ -108,6 +90,7 @@ app = typer.Typer(
     help="Control the turntable rig: enroll objects as views at known angles, and identify them.",
     epilog="\n".join(["Exit codes", "", *(f"{code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())]),
     no_args_is_help=True,
+    rich_markup_mode=None,  # Rich would take a word such as [servo] for markup, and its import takes long
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
 )

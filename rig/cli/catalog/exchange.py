@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.options import JobsOption
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock, seconds_between
@@ -82,6 +81,7 @@ def import_(
     from rig.catalog.derived import load_views
     from rig.catalog.exchange.photographs import Photographs
     from rig.catalog.transfer import Conflict, transfer
+    from rig.cli.ui.present import run_job, size_words
     from rig.core.json_form import plain
     from rig.views.description import BENCH_DESCRIPTOR
 
@@ -201,6 +201,7 @@ def export(
     from rig.catalog.exchange.tables import TableFormat, write_folder, write_views
     from rig.catalog.exchange.training import Annotations, write_training
     from rig.catalog.transfer import CatalogSource
+    from rig.cli.ui.present import run_job
     from rig.core.json_form import plain
 
     form = format_ or _FORMAT_OF.get(target.suffix.lower())

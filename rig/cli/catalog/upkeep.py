@@ -11,7 +11,6 @@ import typer
 from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_CATALOG
-from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
@@ -28,6 +27,7 @@ def verify(settings: Settings) -> None:
     Example: rig catalog verify --bench sim
     """
     from rig.catalog.verify import verify as job
+    from rig.cli.ui.present import run_job, size_words
 
     with settings.open_catalog(read_only=True) as catalog:
         found = run_job("verifying", job(catalog), interrupted="Interrupted; nothing was changed.")
@@ -56,6 +56,7 @@ def gc(
     Example: rig catalog gc --dry-run --bench sim
     """
     from rig.catalog.upkeep import collect_garbage
+    from rig.cli.ui.present import size_words
     from rig.core.json_form import plain
 
     with settings.open_catalog() as catalog:

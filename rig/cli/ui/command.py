@@ -62,8 +62,6 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
     show_parameters(run, [context, *own, *options_of(CommonOptions)])
-    # Typer prints single line breaks of a docstring as they are; let it wrap paragraphs to the terminal instead.
-    run.__doc__ = "\n\n".join(" ".join(part.split()) for part in (function.__doc__ or "").split("\n\n"))
     return run
 
 

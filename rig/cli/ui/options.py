@@ -8,9 +8,6 @@ from typing import Annotated, Any, TypedDict, get_args, get_type_hints
 
 import typer
 
-COMMON: str = "Common options"
-"""Panel of the help."""
-
 
 class CommonOptions(TypedDict):
     """The options of every command, given before or after it."""
@@ -20,31 +17,21 @@ class CommonOptions(TypedDict):
         typer.Option(
             metavar="NAME",
             help="Bench to use: hardware, sim, sim-bench or the bench of a plug-in (default: default_bench).",
-            rich_help_panel=COMMON,
         ),
     ]
     config: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Configuration file (default: rig.toml).", rich_help_panel=COMMON),
+        typer.Option(metavar="FILE", help="Configuration file (default: rig.toml)."),
     ]
     overrides: Annotated[
         list[str] | None,
         typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Replace one setting, for example identify.max_views=4. Repeatable.",
-            rich_help_panel=COMMON,
+            "--set", metavar="KEY=VALUE", help="Replace one setting, for example identify.max_views=4. Repeatable."
         ),
     ]
-    seed: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Seed of the simulated bench.", rich_help_panel=COMMON)
-    ]
-    json: Annotated[
-        bool, typer.Option("--json", help="Print JSON on stdout and text on stderr.", rich_help_panel=COMMON)
-    ]
-    no_color: Annotated[
-        bool, typer.Option("--no-color", help="Print without colours, as with NO_COLOR=1.", rich_help_panel=COMMON)
-    ]
+    seed: Annotated[int | None, typer.Option(min=0, metavar="N", help="Seed of the simulated bench.")]
+    json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout and text on stderr.")]
+    no_color: Annotated[bool, typer.Option("--no-color", help="Print without colours, as with NO_COLOR=1.")]
 
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]

@@ -1,26 +1,27 @@
-"""Tables and progress bars on a terminal.
+"""Tables, sizes and progress bars on a terminal.
 
 This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
 """
 
 import os
 import sys
-from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Final
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import AbstractContextManager, closing
+from typing import TYPE_CHECKING, Final, TypeVar
 
+import typer
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
-from rich.table import Table
-from rich.text import Text
 
+from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
 
 if TYPE_CHECKING:
     from rig.catalog.jobs import JobProgress
 
+_T = TypeVar("_T")
 _PIPE_COLUMNS: Final = 240  # no row of a table is cut for a program that reads it
 
 
@@ -46,17 +47,7 @@ def console(*, stderr: bool = False, plain: bool = False) -> Console:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
-    """Print a table as wide as the terminal; in a pipe print every row in full, as one line."""
-    screen = console()
-    if screen.is_terminal:
-        table: Table = Table(box=None, pad_edge=False)
-        for column in columns:
-            table.add_column(column, justify="right" if column in right else "left", overflow="fold")
-        for row in rows:
-            table.add_row(*map(Text, row))  # a name can contain what Rich would read as markup
-        screen.print(table)
-        return
-    # Rich takes milliseconds for each row
+    """Print a table: every row in full, as one line."""
     lines = [[neutral(cell) for cell in row] for row in (columns, *rows)]
     widths = [max(map(cell_len, cells)) for cells in zip(*lines, strict=True)]
     for line in lines:
@@ -97,3 +88,24 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     def note(self, text: str) -> None:
         """Print a line above the bar."""
         self._bar.console.print(text, markup=False, highlight=False, soft_wrap=not self._bar.console.is_terminal)
+
+
+def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted: str) -> _T:
+    """Run a job of the catalog with a progress bar on stderr and return its result; Ctrl+C prints ``interrupted``."""
+    from rig.catalog.jobs import finished
+
+    try:
+        with closing(job), ProgressBar(title) as progress:
+            return finished(job, progress)
+    except KeyboardInterrupt:
+        print(interrupted, file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def size_words(size: float) -> str:
+    """Return a number of bytes with a unit: "12.3 MB"."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if size < 1000 or unit == "GB":
+            return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
+        size /= 1000
+    raise AssertionError

@@ -1,6 +1,5 @@
 """The help of every command has an example and is fast."""
 
-import inspect
 import os
 import re
 import subprocess
@@ -37,24 +36,6 @@ def test_every_command_has_an_example_that_begins_with_its_name(words):
     assert done.exit_code == 0
     text = " ".join(done.output.split())
     assert f"Example: rig {' '.join(words)}" in text
-
-
-def test_help_shows_words_in_brackets():
-    """Rich would take a word such as [servo] for markup."""
-    words_in_brackets = 0
-    root = typer.main.get_command(app)
-    for words in COMMANDS:
-        command = root
-        for word in words:
-            command = command.commands[word]
-        texts = [inspect.getdoc(command.callback) or "", *(getattr(p, "help", None) or "" for p in command.params)]
-        wanted = {found for text in texts for found in re.findall(r"(?<!\\)\[[^\]]+\]", text.replace("\\[", "["))}
-        if not wanted:
-            continue
-        shown = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "400"}).output
-        assert {found for found in wanted if found not in shown} == set(), words
-        words_in_brackets += len(wanted)
-    assert words_in_brackets >= 1
 
 
 def test_every_error_has_an_exit_code_that_the_help_explains():

@@ -54,7 +54,6 @@ def interrupted(
         ("typer", "--version"),
         ("rig.core.signals", "goto 90 --bench sim"),
         ("rig.cli.objects.runs", "goto 90 --bench sim"),
-        ("rich.markup", "goto --help"),
         ("rig.bench", "goto 90 --bench sim"),  # the command has begun
         ("numpy", "goto 90 --bench sim"),
         ("cv2", "goto 90 --bench sim"),
