@@ -119,44 +119,47 @@ common.__doc__ = None  # or it would replace the help of the app
 show_parameters(common, spread(common))
 app.callback()(common)
 
-SECTIONS: Final = {
-    "Start here": (
-        *("doctor", "empty-table", "enroll", "identify", "results", "catalog"),
-        *("status", "stop", "acknowledge", "serve"),
-    ),
-    "Saved searches and experiments": ("replay", "report", "eval"),
-    "Exchange and log": ("import", "export", "log"),
-    "Table": ("home", "goto", "jog"),
-    "Devices and settings": ("setup", "find", "config", "calibrate", "snapshot", "servo", "head"),
-    "Simulated bench": ("demo", "faults", "sim-bench"),
+SECTIONS: Final[dict[str, dict[str, Any]]] = {
+    "Start here": {
+        "doctor": doctor.doctor,
+        "empty-table": snapshot.empty_table,
+        "enroll": enroll.enroll,
+        "identify": identify.identify,
+        "results": results.app,
+        "catalog": catalog.app,
+        "status": table.status,
+        "stop": table.stop,
+        "acknowledge": table.acknowledge,
+        "serve": serve.serve,
+    },
+    "Saved searches and experiments": {"replay": runs.replay, "report": runs.report, "eval": evaluate.evaluate},
+    "Exchange and log": {"import": exchange.import_, "export": exchange.export, "log": results.log},
+    "Table": {"home": table.home, "goto": table.goto, "jog": table.jog},
+    "Devices and settings": {
+        "setup": doctor.setup,
+        "find": doctor.find,
+        "config": config.app,
+        "calibrate": None,
+        "snapshot": snapshot.snapshot,
+        "servo": servo.app,
+        "head": head.app,
+    },
+    "Simulated bench": {"demo": None, "faults": None, "sim-bench": None},
 }
-"""The sections of the help, with their commands in order. The first one has the commands of a day."""
+"""The commands in the sections and in the order of the help; None is a plug-in. The first section is for each day."""
 
-app.command("enroll")(enroll.enroll)
-app.command("identify")(identify.identify)
-app.command("replay")(runs.replay)
-app.command("report")(runs.report)
-app.command("eval")(evaluate.evaluate)
-app.command("import")(exchange.import_)
-app.command("export")(exchange.export)
-app.command("log")(results.log)
-app.command("empty-table")(snapshot.empty_table)
-app.command("snapshot")(snapshot.snapshot)
-app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)  # an angle can be negative
-app.command("home")(table.home)
-app.command("jog")(table.jog)
-app.command("status")(table.status)
-app.command("stop")(table.stop)
-app.command("acknowledge")(table.acknowledge)
-app.command("doctor")(doctor.doctor)
-app.command("find")(doctor.find)
-app.command("setup")(doctor.setup)
-app.command("serve")(serve.serve)
-app.add_typer(results.app, name="results")
-app.add_typer(catalog.app, name="catalog")
-app.add_typer(config.app, name="config")
-app.add_typer(head.app, name="head")
-app.add_typer(servo.app, name="servo")
+
+def _add(name: str, one: Any) -> None:
+    if isinstance(one, typer.Typer):
+        app.add_typer(one, name=name)
+    else:  # the angle of goto can be negative
+        app.command(name, context_settings={"ignore_unknown_options": True} if name == "goto" else None)(one)
+
+
+for _names in SECTIONS.values():
+    for _name, _one in _names.items():
+        if _one is not None:
+            _add(_name, _one)
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
     try:
         _plugin = _point.load()
@@ -164,10 +167,7 @@ for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         _notice = f"The plug-in {_point.value} cannot be loaded, so there is no command {_point.name}: {_broken}"
         print(neutral(_notice), file=sys.stderr)
         continue
-    if isinstance(_plugin, typer.Typer):
-        app.add_typer(_plugin, name=_point.name)
-    else:
-        app.command(_point.name)(_plugin)
+    _add(_point.name, _plugin)
 
 
 def _with_commands_for(arguments: list[str]) -> typer.Typer:
