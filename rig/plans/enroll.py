@@ -183,7 +183,7 @@ class EnrollmentViews:
         yield moved(len(angles_deg), move)
         trajectory = frames.recorder.fit()
         if trajectory is None or move.agreement is None or not (move.agreement.agrees and trajectory.consistent):
-            disagreement = _flight_disagreement(move, None if trajectory is None else trajectory.residual_deg)
+            disagreement = _disagreement(move, None if trajectory is None else trajectory.residual_deg)
             if move.gyro.valid:
                 self.bench.safety.latch(disagreement)
             raise disagreement
@@ -274,50 +274,36 @@ class EnrollmentViews:
         table.fly(0.0, Flight(pause, reach_deg, table.recorder(), config.velocity_dps, quiet=False))
 
 
-def _disagreement(move: Move) -> RotationDisagreement:
+def _disagreement(move: Move, residual_deg: float | None = None) -> RotationDisagreement:
+    """Return the error that the platter did not follow the servo, or that this is not known.
+
+    ``residual_deg`` is the largest difference on the way, of views in motion.
+    """
+    servo, platter = (angle_words(angle_deg, 2) for angle_deg in (move.rotation_encoder_deg, move.gyro.angle_deg))
+    evidence: dict[str, float] = {"table_deg": round(move.encoder_deg, 2)}
     if move.agreement is None:
         return RotationDisagreement(
-            "It is not known whether the platter followed the servo's rotation of "
-            f"{angle_words(move.rotation_encoder_deg, 2)}: {move.gyro.reason}.",
+            f"It is not known whether the platter followed the servo's rotation of {servo}: {move.gyro.reason}.",
             next_step=("If nothing hit the table,", Do.CONTINUE_ENROLLMENT(), "Otherwise,", Do.ENROLL_AGAIN()),
-            evidence={"table_deg": round(move.encoder_deg, 2)},
+            evidence=evidence,
         )
+    evidence |= {
+        "difference_deg": round(move.agreement.difference_deg, 3),
+        "bound_deg": round(move.agreement.bound_deg, 3),
+    }
+    way = ""
+    if residual_deg is not None:
+        way = f" On the way they differed by up to {residual_deg:.2f}°."
+        evidence["residual_deg"] = round(residual_deg, 3)
     return RotationDisagreement(
-        f"The servo rotated {angle_words(move.rotation_encoder_deg, 2)}, but the platter "
-        f"{angle_words(move.gyro.angle_deg, 2)}.",
+        f"The servo rotated {servo}, but the platter {platter}.{way}",
         next_step=(
             "Tighten the platter.",
             Do.ACKNOWLEDGE(),
             Do.ENROLL_AGAIN(),
             "Views from before and after a slip do not fit together.",
         ),
-        evidence={
-            "difference_deg": round(move.agreement.difference_deg, 3),
-            "bound_deg": round(move.agreement.bound_deg, 3),
-            "table_deg": round(move.encoder_deg, 2),
-        },
-    )
-
-
-def _flight_disagreement(move: Move, residual_deg: float | None) -> RotationDisagreement:
-    servo, platter = (angle_words(angle_deg, 2) for angle_deg in (move.rotation_encoder_deg, move.gyro.angle_deg))
-    what = f"The servo rotated {servo}, the platter {platter}"
-    if residual_deg is not None:
-        what += f", and on the way they differed by up to {residual_deg:.2f}°"
-    return RotationDisagreement(
-        f"{what}. No view of this revolution is stored.",
-        next_step=(
-            "Tighten the platter.",
-            Do.ACKNOWLEDGE(),
-            Do.ENROLL_AGAIN(),
-            "If the gyro lost samples, check the IMU's cable, and",
-            Do.CONTINUE_ENROLLMENT(),
-        ),
-        evidence={
-            "table_deg": round(move.encoder_deg, 2),
-            "residual_deg": None if residual_deg is None else round(residual_deg, 3),
-            "gyro": move.gyro.reason or "valid",
-        },
+        evidence=evidence,
     )
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap360
 from hbr.dense.pixel_fit import LocalView
-from hbr.dense.session import Asking, answered
+from hbr.dense.session import answered
 from rig.bench import Bench, Placer
 from rig.catalog import Catalog, Provenance
 from rig.catalog.journal import open_for_enrollment
@@ -69,6 +69,7 @@ STAMPS: Final = 30
 MOST_FLIGHTS: Final = 8
 MOST_REJECTED: Final = 15  # half a second at 30 frames/s: what spoils so many does not pass by itself
 """Number of successive rejected frames after which the table stops and the next view is taken at rest."""
+_SAID: Final = ("what", "next_step", "steps")
 NEW_GOAL_DEG: Final = 10.0  # smaller: the table changes its speed for goals that show nearly the same side
 
 
@@ -80,8 +81,6 @@ class ViewsAtRest:
     ----------
     check
         Gets image and azimuth of the first view, and raises an error if it shows no object.
-    compared
-        Takes a step of the search that asks for enrolled views.
     live
         Called with the event of each frame of a search in motion.
     number
@@ -93,11 +92,11 @@ class ViewsAtRest:
     """
 
     bench: Bench
+    model: Model
     search: Search
     viewer: Viewer
     describe: SearchDescriber
     check: Callable[[NDArray[np.uint8], float], None]
-    compared: Callable[[Asking[Event | None]], Generator[Event, None, None]]
     live: Callable[[FrameUsed], object]
     first_rest_s: float = FIRST_REST_S
     number: int = 0
@@ -109,6 +108,7 @@ class ViewsAtRest:
     locks: CameraLocks = field(init=False)
     unseen: list[Event] = field(default_factory=list)
     _orientation_deg: float = field(init=False)
+    _missing: CatalogError | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.table = Turntable(self.bench, first_rest_s=self.first_rest_s)
@@ -144,11 +144,32 @@ class ViewsAtRest:
         self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
         if (changed := self.search.changed()) is not None:
             yield changed
-        yield from self.compared(self.search.verify(self.describe.hypotheses))
+        yield from self._compared()
         ranked, step = self.search.decide()
         self.ended_ns, self.is_over = self.bench.clock.now_ns(), isinstance(step, Finish)
         if self.search.is_new_decision:
             yield ranked
+
+    def _compared(self) -> Generator[Event, None, None]:
+        """Compare the views with enrolled ones, if the search asks for them.
+
+        If an enrolled image is missing, the search decides without it; only the first one is reported.
+        """
+        known = self._missing
+        event = answered(self.search.verify(self.describe.hypotheses), self._enrolled)
+        if known is None and self._missing is not None:
+            values = {key: value for key, value in self._missing.as_dict().items() if key in _SAID}
+            yield Warned(None, Note(NoteCode.NOT_COMPARED, values))
+        if event is not None:
+            yield event
+
+    def _enrolled(self, object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
+        read, name = self.model.leader_views, self.search.names[object_index]
+        try:
+            return None if read is None else read(name, azimuths_deg)
+        except CatalogError as error:
+            self._missing = error
+            return None
 
     def rotate(self, step: Rotate) -> Generator[Event, None, None]:
         """Rotate to the next view: within the cable budget, and use the measured rotation.
@@ -350,8 +371,7 @@ def identify(
     )
     # Take views until the search ends.
     kind = ViewsInMotion if search.in_motion else ViewsAtRest
-    compared = _Comparisons(model, search)
-    views = kind(bench, search, viewer, describe, check, compared, live)
+    views = kind(bench, model, search, viewer, describe, check, live)
     try:
         with views.table as table:
             yield from views.begin()
@@ -398,38 +418,6 @@ def _unwound(number: int, table: Turntable) -> Generator[Event, None, RigError |
     except RigError as error:
         return error
     return None
-
-
-@dataclass(eq=False)
-class _Comparisons:
-    """Takes the steps of a search that ask for enrolled views, and yields their events.
-
-    If an enrolled image is missing, the search decides without it; only the first one is reported.
-    """
-
-    model: Model
-    search: Search
-    _missing: CatalogError | None = field(default=None, init=False)
-
-    def __call__(self, step: Asking[Event | None]) -> Generator[Event, None, None]:
-        known = self._missing
-        event = answered(step, self._enrolled)
-        if known is None and self._missing is not None:
-            values = {key: value for key, value in self._missing.as_dict().items() if key in _SAID}
-            yield Warned(None, Note(NoteCode.NOT_COMPARED, values))
-        if event is not None:
-            yield event
-
-    def _enrolled(self, object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
-        read, name = self.model.leader_views, self.search.names[object_index]
-        try:
-            return None if read is None else read(name, azimuths_deg)
-        except CatalogError as error:
-            self._missing = error
-            return None
-
-
-_SAID: Final = ("what", "next_step", "steps")
 
 
 def watch(

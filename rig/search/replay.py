@@ -29,9 +29,6 @@ from rig.views.description import SearchDescriber
 TOLERANCE: Final = 1e-9
 """Largest difference of equal numbers, because another machine may sum in another order."""
 
-SHOWN_CHARACTERS: Final = 60
-"""Longest text of a value in the summary of a difference."""
-
 
 @dataclass(frozen=True, slots=True)
 class ReplayDifference:
@@ -44,15 +41,6 @@ class ReplayDifference:
 
     def __str__(self) -> str:
         return f"view {self.view}, {self.what}: saved {self.saved}, computed {self.computed}"
-
-    def summary(self) -> str:
-        """Return the difference on one line; long values are cut."""
-        return str(replace(self, saved=_cut(self.saved), computed=_cut(self.computed)))
-
-
-def _cut(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 1]}…"
 
 
 @dataclass(slots=True)

@@ -29,6 +29,7 @@ from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.core.next_steps import Do
+from rig.core.phrases import short
 from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
 from rig.search.model import Model, empty_table_for, model_of
 from rig.views import image_files as images
@@ -44,15 +45,6 @@ _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.j
 """Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
 _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
 """Exceptions because of values of a wrong type."""
-_WORDS: Final = {
-    KeyError: "the value {0!r} is missing",
-    IndexError: "a list is too short",
-    RecursionError: "its values are nested too deeply",
-    ArithmeticError: "a number is too large or too small",
-    AttributeError: "a value has the wrong kind",
-    cv2.error: "a value has the wrong kind",
-}
-"""Python's own errors in words."""
 
 
 class RunWriter:
@@ -324,9 +316,8 @@ def _bytes(folder: Path, name: str) -> bytes:
 
 def _reason(error: Exception) -> str:
     """Return an error in words; of Python's own errors, only those of a ValueError or TypeError are useful."""
-    words = next((words for kind, words in _WORDS.items() if isinstance(error, kind)), None)
-    text = str(error) if words is None else words.format(*error.args)
-    return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}…"
+    text = str(error) if isinstance(error, ValueError | TypeError) else "a value is missing, or it has the wrong kind"
+    return short(text, MAX_REASON)
 
 
 def _damaged(folder: Path, reason: str) -> UsageError:

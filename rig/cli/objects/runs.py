@@ -9,7 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ReplayMismatch, RunIncomplete, UsageError
 from rig.core.next_steps import Do
-from rig.core.phrases import counted
+from rig.core.phrases import counted, short
 
 if TYPE_CHECKING:
     from rig.search.saved_run import SavedRun
@@ -105,17 +105,15 @@ def _check(settings: Settings, saved: "SavedRun") -> None:
         found = check(saved)
     done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."
     if found.differences:
-        more = 0 if settings.json else len(found.differences) - SHOWN
-        listed = (
-            [str(one) for one in found.differences]
-            if settings.json
-            else [one.summary() for one in found.differences[:SHOWN]]
-        )
+        listed = [str(one) for one in found.differences]
+        if not settings.json:
+            more = len(listed) - SHOWN
+            listed = [short(one, 120) for one in listed[:SHOWN]] + [f"and {more} more: --json"] * (more > 0)
         raise ReplayMismatch(
             f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {done}",
             next_step="Check whether the files of the run were changed. If not, this version of the program decides "
             f"differently from {saved.about['software']}, which saved the run.",
-            evidence={"differences": [*listed, f"and {more} more: --json"] if more > 0 else listed},
+            evidence={"differences": listed},
         )
     if not found.is_complete:
         raise RunIncomplete(

@@ -4,8 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-from rig.search.replay import ReplayDifference
-
 
 def test_saved_run_is_replayed_checked_and_reported(rig, enrolled):
     folder, outputs = enrolled
@@ -54,12 +52,6 @@ def test_replay_check_sums_differences_up(rig, tmp_path):
     assert short.count("    view ") == 3
     assert f"and {count - 3} more: --json" in short
     assert rig("replay", run, "--check", "--json").stderr.count("    view ") == count
-
-
-def test_difference_of_long_values_is_cut():
-    one = ReplayDifference(2, "candidates", ["mug-white"] * 50, 1)
-    assert len(one.summary()) < 120
-    assert str(one).count("mug-white") == 50
 
 
 def test_missing_runs_and_existing_folders_are_rejected(rig):
