@@ -52,12 +52,8 @@ class FoundCamera:
 
 @dataclass
 class DeviceScan:
-    """A scan of all ports, buses and cameras, and the devices found.
+    """A scan of all ports, buses and cameras, and the devices found."""
 
-    ``both_protocols`` also searches for servos of Protocol 1.0 if some of Protocol 2.0 answered.
-    """
-
-    both_protocols: bool = False
     ports: tuple[str, ...] | None = None
     """Serial ports to scan; None: all on USB, and the configured one."""
     servos: list[tuple[SerialPort, FoundServo]] = field(default_factory=list)
@@ -144,7 +140,7 @@ class DeviceScan:
         try:
             servos = False if known_head else (yield from self._servos(context, port, 2, BAUD_RATES))
             head = False if servos else (yield from self._head(context, port))
-            if not (head or known_head) and (self.both_protocols or not servos):
+            if not (head or known_head or servos):
                 servos = (yield from self._servos(context, port, 1, BAUD_RATES_1)) or servos
         except DeviceNotFound as error:
             yield of_error("servo", error)

@@ -95,13 +95,7 @@ def print_findings(settings: Settings) -> dict[str, Any]:
 
 
 @command
-def find(
-    settings: Settings,
-    both_protocols: Annotated[
-        bool,
-        typer.Option("--all", help="Also search for AX-12A (protocol 1.0) if other servos answered. Takes a minute."),
-    ] = False,
-) -> None:
+def find(settings: Settings) -> None:
     """List the connected servos (at all baud rates), IMUs and cameras, and their settings for rig.toml.
 
     Writes nothing and moves nothing. Exit code 4 if no device was found.
@@ -111,7 +105,7 @@ def find(
     from rig.config.toml_file import with_values
 
     with doctor_context(settings) as context:
-        findings, wanted = _scanned(context, None if settings.json else sys.stdout, both_protocols)
+        findings, wanted = _scanned(context, None if settings.json else sys.stdout)
     if settings.json:
         settings.print_json(
             {
@@ -168,16 +162,14 @@ def setup(settings: Settings) -> None:
         raise typer.Exit(code)
 
 
-def _scanned(
-    context: "DoctorContext", out: "TextIO | None", both_protocols: bool = False
-) -> "tuple[list[Finding], dict[Key, Any]]":
+def _scanned(context: "DoctorContext", out: "TextIO | None") -> "tuple[list[Finding], dict[Key, Any]]":
     """Search all ports, buses and cameras; return the findings, and the settings of the unambiguous devices."""
     from rig.cli.ui.present import console
     from rig.doctor.device_scan import DeviceScan
     from rig.doctor.examination import run_checks
 
     context.require_free()
-    scan = DeviceScan(both_protocols)
+    scan = DeviceScan()
     findings = []
     for finding in run_checks(context, scan.checks, show_progress):
         findings.append(finding)

@@ -11,7 +11,7 @@ from rig.catalog.copying import open_or_copy
 from rig.catalog.jobs import JobProgress
 from rig.catalog.journal import BackgroundDelivery, waiting
 from rig.cli.ui import prompts
-from rig.cli.ui.present import ProgressBar as ProgressBar
+from rig.cli.ui.present import ProgressBar
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
 from rig.core.next_steps import in_words

@@ -52,22 +52,15 @@ class TerminalOperator:
                 return choice
 
     def ask_sample(self) -> str | None:
-        return ask_sample()
+        """Ask until the sample is valid text; a barcode scanner answers, too: it types the code and presses Enter."""
+        from rig.catalog.results import clean_text
 
-
-def ask_sample() -> str | None:
-    """Ask for the sample on the table until it is valid text; None if the operator gives none.
-
-    A barcode scanner that acts as a keyboard answers, too: it types the code and presses Enter.
-    """
-    from rig.catalog.results import clean_text
-
-    while True:
-        answer = ask_line("Sample (scan or type it; Enter for none):", otherwise="give --sample")
-        try:
-            return clean_text(answer, "sample") if answer else None
-        except UsageError as error:
-            print(f"{error.what} {error.next_step}", file=sys.stderr)
+        while True:
+            answer = ask_line("Sample (scan or type it; Enter for none):", otherwise="give --sample")
+            try:
+                return clean_text(answer, "sample") if answer else None
+            except UsageError as error:
+                print(f"{error.what} {error.next_step}", file=sys.stderr)
 
 
 def read_answer(question: str) -> str | None:

@@ -34,17 +34,6 @@ def lines(output: str) -> list[dict]:
     return [json.loads(line) for line in output.splitlines()]
 
 
-def test_enrolled_object_is_shown(rig):
-    done = rig("enroll", "mug-dots", "--views", "4", "--label", "kitchen")
-    assert done.exit_code == 0, done.output
-    shown = rig("catalog", "show", "mug-dots")
-    assert "4 of 4 views" in shown.stdout
-    assert max(map(len, shown.stdout.splitlines())) < 200
-    assert "placement_mm" not in shown.stdout
-    assert "placement_mm" in rig("catalog", "show", "mug-dots", "--json").stdout
-    assert Path("catalog/images").is_dir()
-
-
 def test_views_have_the_time_of_their_bench(rig):
     assert rig("enroll", "dice", "--views", "4").exit_code == 0
     result = json.loads(rig("catalog", "show", "dice", "--json").stdout)
@@ -53,28 +42,6 @@ def test_views_have_the_time_of_their_bench(rig):
     assert enrollment["started_utc"] < captured[0]
     assert captured == sorted(captured)
     assert captured[-1] < enrollment["finished_utc"]
-
-
-@pytest.mark.nightly
-def test_catalog_depends_on_nothing_but_the_seed(rig):
-    def enrolled(seed: str, folder: str) -> tuple[list[bytes], bytes]:
-        assert rig("enroll", "dice", "--views", "4", "--seed", seed, "--set", f"catalog.path={folder}").exit_code == 0
-        with Catalog.open(folder, clock=SystemClock(), read_only=True) as catalog:
-            descriptors = catalog.views().views.descriptors.tobytes()
-        return [path.read_bytes() for path in sorted(Path(folder, "images").rglob("*.png"))], descriptors
-
-    images, descriptors = enrolled("7", "first")
-    assert len(images) == 4 + 1  # and the empty-table image
-    assert enrolled("7", "again") == (images, descriptors)
-    assert enrolled("8", "other")[0] != images
-
-
-def test_a_search_can_end_after_the_only_view_that_it_may_take(rig):
-    rig("enroll", "mug-dots", "--views", "6")
-    one_view = ("--set", "identify.max_views=1", "--set", "identify.min_views=1")
-    for strategy in ("dense", "hbr"):
-        done = rig("identify", "--set", "bench.sim.object=mug-dots", *one_view, "--strategy", strategy)
-        assert (done.exit_code, done.stdout.count("candidates:")) in ((0, 1), (10, 1))
 
 
 def test_missing_catalog_names_the_bench_that_has_one(rig, monkeypatch, tmp_path):

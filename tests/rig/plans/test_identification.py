@@ -77,15 +77,6 @@ def test_each_ranking_follows_from_the_accepted_images(shelf_of_three):
             assert event.margin == pytest.approx(hbr.score_margin(again, np.array(queries)) / len(queries), abs=1e-3)
 
 
-def test_object_that_is_not_enrolled_is_unknown_after_all_views(shelf_of_three):
-    s, index = shelf_of_three
-    s.operator.next_object = "radio"
-    answer = list(identify(s.bench, index))[-1]
-    assert answer.name is None
-    assert answer.views == s.bench.config.identify.max_views
-    assert answer.candidates
-
-
 def test_cable_is_unwound_when_a_decision_would_leave_the_limits(simulated, shelf_of_three):
     _, index = shelf_of_three
     s = simulated("table.limits_deg=[-180, 185]", "identify.margin=1", "identify.max_views=6", seed=2)

@@ -10,10 +10,8 @@ from rig.catalog import Catalog, derived
 from rig.catalog.describing import FEWEST_VIEWS, described
 from rig.core.errors import (
     CameraSettingsDiffer,
-    CatalogError,
     DeviceFault,
     DeviceSilent,
-    ObjectNotFound,
     RigError,
     RotationDisagreement,
     ViewRejected,
@@ -23,7 +21,7 @@ from rig.events.events import Accepted, Enrolled, Moved, Rejected, Started, even
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
-from rig.search.model import load_model, model_of
+from rig.search.model import load_model
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR, EnrollmentDescriber
 
 VIEWS = 8
@@ -139,34 +137,6 @@ def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):
         if isinstance(event, Accepted):
             stored += 1
             assert len(catalog.resumable("dice").enrollment.present) == stored
-
-
-def test_interrupted_enrollment_keeps_its_views_and_resume_takes_the_missing_ones(simulated, catalog):
-    s = simulated()
-    plan = enroll(s.bench, catalog, "lamp", views=6)
-    for event in plan:
-        if isinstance(event, Accepted) and event.index == 2:
-            break
-    plan.close()
-    assert torque(s) == 0
-    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2)
-    with pytest.raises(CatalogError, match="unfinished"):
-        next(enroll(s.bench, catalog, "lamp", views=6))
-    taken = [e.index for e in enroll(s.bench, catalog, "lamp", resume=True) if isinstance(e, Accepted)]
-    assert taken == [3, 4, 5]
-    assert catalog.object("lamp").summary.views == 6
-
-
-def test_conditions_of_a_view_are_stored_with_it(simulated, catalog):
-    """The conditions are the calibration in force, the camera settings, and the findings of opening the bench."""
-    s = simulated("imu.scale=1.007")
-    list(enroll(s.bench, catalog, "dice", views=4))
-    provenance = catalog.object("dice").complete.sessions[0].provenance
-    assert provenance.conditions["imu"]["scale"] == 1.007
-    assert provenance.conditions["table"]["zero_deg"] == s.bench.config.table.zero_deg
-    assert provenance.conditions["camera"]["exposure_us"] == s.bench.config.camera.exposure_us
-    assert "servo: Operating Mode was 3, is now 4" in provenance.conditions["findings"]
-    assert provenance.devices["servo"]["model"] == "xl430_w250"
 
 
 def test_darkness_causes_retakes_and_ends_the_enrollment_without_losing_views(simulated, catalog):
@@ -314,30 +284,6 @@ def test_events_are_valid_json_without_gyro_values(simulated, catalog):
     assert None in rejected
 
 
-def test_events_depend_on_nothing_but_the_seed(simulated, tmp_path):
-    def run(seed: int, folder: str) -> list[dict]:
-        s = simulated(seed=seed)
-        with Catalog.open(tmp_path / folder, clock=s.bench.clock) as catalog:
-            events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=3)]
-            return events + [event_dict(e) for e in identify(s.bench, model_of(derived.views(catalog)))]
-
-    events = run(5, "a")
-    assert events == run(5, "b")
-    assert events != run(6, "c")
-
-
-def test_mistyped_name_leaves_nothing_in_the_catalog(simulated, catalog):
-    s = simulated()
-    plan = enroll(s.bench, catalog, "nonsense", views=6)
-    with pytest.raises(ObjectNotFound):
-        list(plan)
-    assert catalog.objects() == []
-    list(enroll(s.bench, catalog, "dice", views=4))
-    with pytest.raises(ObjectNotFound):
-        list(enroll(s.bench, catalog, "nonsense", views=6, label="x"))
-    assert [o.name for o in catalog.objects()] == ["dice"]
-
-
 def test_enrollment_ends_with_the_cable_unwound(simulated, catalog):
     s = simulated()
     list(enroll(s.bench, catalog, "dice", views=6))
@@ -357,21 +303,3 @@ def test_resume_finishes_an_enrollment_that_has_all_its_views(simulated, catalog
     assert catalog.object("dice").summary.views == 4
     found = described(catalog.database, catalog.object("dice").complete, "dice")
     assert {one["together"] for one in found.segmentation} == {4}
-
-
-def test_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, catalog):
-    s = simulated()
-    list(enroll(s.bench, catalog, "dice", views=4))
-    old = catalog.version()
-    assert len(derived.views(catalog)) == 4
-    again = enroll(s.bench, catalog, "dice", views=5, replace=True)
-    for event in again:
-        if isinstance(event, Enrolled):
-            break
-        assert catalog.version() == old
-        if isinstance(event, Accepted) and event.index == 3:
-            again.close()  # an interruption does not change that
-    assert catalog.version() == old
-    list(enroll(s.bench, catalog, "dice", resume=True))
-    assert catalog.version() != old
-    assert len(derived.views(catalog)) == 5

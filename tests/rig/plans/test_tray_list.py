@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rig.catalog import Catalog
 from rig.core.errors import NoObject, ObjectNotFound, RotationDisagreement, UsageError, ViewRejected
-from rig.events.events import Accepted, Enrolled, Item
+from rig.events.events import Accepted, Item
 from rig.plans.enroll import enroll
 from rig.plans.operator import Choice, Subject
 from rig.plans.tray import OBJECT_ERRORS, TrayItem, enroll_tray, read_tray
@@ -139,24 +139,6 @@ def interrupted(s, catalog, name, views=4):
     plan.close()
 
 
-def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, catalog):
-    s = simulated()
-    list(enroll(s.bench, catalog, "dice", views=4))
-    interrupted(s, catalog, "lamp")
-    operator = Scripted()
-    events = list(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"), views=4, operator=operator))
-    assert actions(events) == [("dice", "skip"), ("lamp", "resume"), ("clock", "enroll")]
-    resumed, put = operator.brought
-    assert resumed.startswith("2 of 3: lamp has 2 views of an interrupted enrollment.")
-    assert put.startswith("3 of 3: put clock on the table")
-    assert [e.name for e in events if isinstance(e, Enrolled)] == ["lamp", "clock"]
-    assert actions(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"))) == [
-        ("dice", "skip"),
-        ("lamp", "skip"),
-        ("clock", "skip"),
-    ]
-
-
 def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog):
     s = simulated()
     interrupted(s, catalog, "lamp")
@@ -203,13 +185,3 @@ def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
     with pytest.raises(ObjectNotFound):
         list(enroll_tray(s.bench, catalog, items("nonsense"), views=4))
     assert {NoObject, ViewRejected, RotationDisagreement, ObjectNotFound} == set(OBJECT_ERRORS)
-
-
-def test_views_label_and_note_of_the_list_are_used(simulated, catalog):
-    s = simulated()
-    tray = [TrayItem(2, "dice", "toys", "loaded", 5), TrayItem(3, "lamp")]
-    list(enroll_tray(s.bench, catalog, tray, views=4))
-    assert [(o.name, o.label, o.note, o.views) for o in catalog.objects()] == [
-        ("dice", "toys", "loaded", 5),
-        ("lamp", "", "", 4),
-    ]

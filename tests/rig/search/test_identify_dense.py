@@ -9,7 +9,7 @@ import hbr
 from rig.catalog import Catalog
 from rig.events.events import Accepted, Decided, Identified, Note, NoteCode, Ranked, RotationReason, Started, Warned
 from rig.plans.enroll import enroll
-from rig.plans.identify import identify, watch
+from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
 from rig.search.model import load_model
 from rig.views.description import BENCH_DESCRIPTOR
@@ -149,22 +149,6 @@ def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(sim
         probability = [one.probability for one in ranked[event.index].candidates]
         leading = probability[0] / sum(probability)  # among the enrolled objects
         assert (leading >= 0.95) == (event.reason is RotationReason.NEW_SIDE)
-
-
-def test_watch_finds_objects_enrolled_meanwhile(simulated, tmp_path):
-    s = simulated()
-    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        list(enroll(s.bench, catalog, "lamp", views=4))
-        s.operator.next_object = "lamp"
-        names = []
-        for event in watch(s.bench, lambda: identify(s.bench, load_model(catalog))):
-            if isinstance(event, Identified):
-                names.append(event.name)
-                if len(names) == 2:
-                    break
-                list(enroll(s.bench, catalog, "dice", views=4))
-                s.operator.next_object = "dice"
-    assert names == ["lamp", "dice"]
 
 
 def test_one_object_is_found_by_similarity_to_its_own_views(simulated, tmp_path):

@@ -10,8 +10,7 @@ import pytest
 from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
 from rig.catalog.results import find_results
-from rig.events.events import Accepted, Event, Identified, LeftOut, LeftOutReason, Moved, ObjectChanged, Ranked, Started
-from rig.events.lines import line
+from rig.events.events import Accepted, Event, Identified, Moved, ObjectChanged, Started
 from rig.plans.identify import ResultRecorder, watch
 from rig.search.model import Model
 from rig.search.replay import check
@@ -61,31 +60,6 @@ def saved(bench: Bench, model: Model, folder: Path, strategy: str = "dense") -> 
 
 def of_kind(kind: type[T], events: list[Event]) -> list[T]:
     return [event for event in events if isinstance(event, kind)]
-
-
-def test_search_at_rest_names_the_new_object(model: Model, tmp_path: Path) -> None:
-    with opened(REPLACED) as bench:
-        events = saved(bench, model, tmp_path / "run")
-    (changed,) = of_kind(ObjectChanged, events)
-    assert (changed.index, changed.first) == (1, 1)
-    assert changed.evidence > changed.needed
-    assert [event.index for event in of_kind(Ranked, events)] == [e.index for e in of_kind(Accepted, events)]
-    answer = of_kind(Identified, events)[-1]
-    assert answer.name == "toy-car"
-    assert answer.left_out == (LeftOut(0, LeftOutReason.OBJECT_CHANGED),)
-    assert answer.views == len(of_kind(Accepted, events)) - 1
-    assert "begins again with view 2" in line(changed)
-    assert "1 earlier view did not count" in line(answer)
-
-
-def test_search_in_motion_names_the_new_object(model: Model, tmp_path: Path) -> None:
-    with opened(REPLACED) as bench:
-        events = saved(bench, model, tmp_path / "run", "arc")
-    (changed,) = of_kind(ObjectChanged, events)
-    answer = of_kind(Identified, events)[-1]
-    assert answer.name == "toy-car"
-    assert [one.index for one in answer.left_out] == list(range(changed.first))
-    assert answer.views + len(answer.left_out) == len(of_kind(Accepted, events))
 
 
 def test_last_steps_use_the_views_of_the_new_object_alone(model: Model, tmp_path: Path) -> None:

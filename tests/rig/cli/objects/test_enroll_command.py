@@ -7,36 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.cli.main import app
-from rig.events.events import SimilarObjects
-
-
-def test_enrollment_ends_with_similar_objects(enrolled):
-    _, outputs = enrolled
-    assert "looks like no other enrolled object" in outputs["lamp"].stdout
-    events = [json.loads(line) for line in outputs["dice"].stdout.splitlines()]
-    assert events[-2].keys() == {"event", *(SimilarObjects.__dataclass_fields__)}
-    assert events[-1]["event"] == "enrolled"
 
 
 def test_label_option_is_repeatable(rig):
     listed = json.loads(rig("catalog", "list", "--json").stdout)
     assert next(o["label"] for o in listed["objects"] if o["name"] == "lamp") == "kitchen, brass"
-
-
-def test_training_set_is_exported_and_imported(rig, tmp_path):
-    target = str(tmp_path / "set")
-    words = ["export", target, "dice", "--format", "coco", "--json"]
-    done = rig(*words)
-    assert json.loads(done.stdout) == {
-        "target": target,
-        "format": "coco",
-        "objects": 1,
-        "views": {"train": 5, "val": 1, "test": 0},
-        "without_mask": 0,
-    }
-    assert rig(*words).exit_code == 7
-    imported = json.loads(rig("import", target, "--json", "--set", f"catalog.path={tmp_path / 'new'}").stdout)
-    assert (imported["objects"], imported["views"], imported["rejected"]) == (1, 6, [])
 
 
 @pytest.mark.parametrize(

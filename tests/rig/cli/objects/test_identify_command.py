@@ -1,26 +1,19 @@
 """`rig identify`: strategies, recorded results, and an object that comes while it waits."""
 
-import csv
 import errno
 import json
 import os
-import re
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 
-from sqlalchemy import delete, func, select
 from typer.testing import CliRunner
 
 from rig.catalog import Catalog
-from rig.catalog.facts import Derived
 from rig.catalog.images import Images
 from rig.cli.main import app
-from rig.cli.ui.exit_codes import EXIT_QUALITY, EXIT_UNKNOWN
+from rig.cli.ui.exit_codes import EXIT_QUALITY
 from rig.core.clock import SystemClock
 from rig.search.model import CurrentModel
-from rig.views.description import BENCH_DESCRIPTOR
 from rig.views.object_presence import TableWatcher
 from sim.bench import ShelfOperator
 from sim.objects.shelf import shelf
@@ -28,31 +21,6 @@ from sim.objects.shelf import shelf
 
 def in_json(done):
     return [json.loads(line) for line in done.stdout.splitlines()]
-
-
-def test_identification_is_recorded_corrected_and_exported(rig, tmp_path):
-    (first, *_) = in_json(rig("results", "list", "--json"))
-    assert (first["object"], first["outcome"], first["sample"], first["bench"]) == ("dice", "found", None, "sim")
-    with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
-        assert first["catalog_version"] == catalog.version()
-    assert Path("catalog", first["image"]).is_file()
-    shown = rig("results", "show", "1").stdout
-    assert re.search("^object +dice$", shown, re.MULTILINE)
-    assert re.search("^candidates +dice 0[.]", shown, re.MULTILINE)
-    wrong = rig("results", "correct", "1", "--object", "dise", "--reason", "label")
-    assert wrong.exit_code == 7
-    assert "Did you mean 'dice'?" in wrong.stderr
-    assert rig("results", "correct", "1", "--sample", "S-1", "--reason", "label \x1b[2J read").exit_code == 2
-    corrected = rig("results", "correct", "1", "--sample", "S-1", "--reason", "label read")
-    assert corrected.stdout == "Result 1 is now dice, sample S-1.\n"
-    assert "label read" in rig("results", "show", "1").stdout
-    assert "dice *" in rig("results", "list", "--sample", "S-1").stdout
-    assert rig("results", "list", "--sample", "S-2").stdout == "No results match.\n"
-    log = rig("log").stdout
-    assert "identified" in log
-    assert "result corrected" in log
-    assert rig("results", "export", str(tmp_path / "a.csv"), "--object", "dice").exit_code == 0
-    assert rig("results", "export", str(tmp_path / "a.txt")).exit_code == 2
 
 
 def test_each_search_of_watch_asks_for_the_sample(enrolled, monkeypatch):
@@ -94,7 +62,7 @@ def test_sample_of_watch_is_that_of_the_object_on_the_table(rig, with_operator, 
 
     scanned_ns: list[int] = []
     monkeypatch.setattr("rig.jobs.identify.TableWatcher", Comes)
-    monkeypatch.setattr("rig.cli.ui.prompts.ask_sample", scan)
+    monkeypatch.setattr("rig.cli.ui.prompts.TerminalOperator.ask_sample", lambda _: scan())
     done = rig("identify", "--watch", "--scan", "--json")
     assert done.exit_code == 130, done.output
     events = in_json(done)
@@ -123,45 +91,6 @@ def test_answer_is_printed_even_if_it_cannot_be_recorded(rig, monkeypatch):
     assert "Recorded" not in done.output
 
 
-def test_dense_is_the_default_strategy(rig, enrolled):
-    def searched(*words: str) -> tuple[list[dict], str]:
-        done = rig("identify", "--json", "--set", "bench.sim.object=lamp", *words)
-        return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
-
-    events, _ = searched("--save-run", "runs/own")
-    started, *_, answer, _ = (event for event in events if event["event"] != "empty_table_image")
-    assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", BENCH_DESCRIPTOR, "lamp")
-    assert 0.9 < answer["confidence"] <= 1
-    assert answer["confidence"] + answer["not_enrolled"] <= 1
-    assert not started["notes"]
-    assert rig("replay", "runs/own", "--check").exit_code == 0
-    assert rig("report", "runs/own").exit_code == 0
-    page = (enrolled[0] / "runs" / "own" / "report.html").read_text(encoding="utf-8")
-    assert ("What was weighed before each turn" in page) == any(e["event"] == "decided" for e in events)
-    events, _ = searched("--set", "identify.strategy=ahbr")
-    assert next(e for e in events if e["event"] == "started")["strategy"] == "ahbr"
-
-
-def test_catalog_without_descriptions_is_described_before_the_search(enrolled, tmp_path, monkeypatch):
-    shutil.copytree(enrolled[0] / "catalog", tmp_path / "catalog")
-    shutil.copy(enrolled[0] / "rig.toml", tmp_path)
-    monkeypatch.chdir(tmp_path)
-    with Catalog.open("catalog", clock=SystemClock()) as catalog, catalog.database.write() as transaction:
-        transaction.execute(delete(Derived))
-    run = CliRunner().invoke
-    done = run(app, ["identify", "--json", "--set", "bench.sim.object=lamp"])
-    assert done.exit_code == 0, done.output
-    assert '"strategy": "dense"' in done.stdout
-    with Catalog.open("catalog", clock=SystemClock()) as catalog, catalog.database.read() as transaction:
-        assert transaction.scalar(select(func.count()).select_from(Derived)) > 0
-
-
-def test_unknown_strategy_is_rejected(rig):
-    done = rig("identify", "--strategy", "swep")
-    assert done.exit_code == 2
-    assert "Did you mean sweep?" in done.stderr
-
-
 def test_closed_pipe_ends_the_command_without_an_error(enrolled):
     folder, _ = enrolled
     command = (
@@ -171,28 +100,6 @@ def test_closed_pipe_ends_the_command_without_an_error(enrolled):
     assert done.stdout.splitlines()[-1] in ("0", "8", "141")  # it can end before head does
     assert "Traceback" not in done.stderr
     assert "Error" not in done.stderr
-
-
-def test_watch_waits_until_the_camera_sees_an_object(rig, with_operator, monkeypatch):
-    class Comes(TableWatcher):
-        """Puts an object on the table while the command waits."""
-
-        def place(self, name):
-            (world,) = with_operator
-            if self._empty is not None:
-                raise KeyboardInterrupt
-            world.clock.call_at(world.clock.now_ns() + 3 * 10**9, lambda: world.put(shelf()["lamp"], 33.0))
-            super().place(name)
-
-    monkeypatch.setattr("rig.jobs.identify.TableWatcher", Comes)
-    done = rig("identify", "--watch", "--json")
-    assert done.exit_code == 130
-    events = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [e["name"] for e in events if e["event"] == "identified"] == ["lamp"]
-    assert [e["reason"] for e in events if e["event"] == "waiting"] == [
-        "first-object",
-        "next-object",
-    ]
 
 
 def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
@@ -205,30 +112,6 @@ def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
         assert rig("enroll", "amphora", "--views", "4").exit_code == 0
         assert "amphora" not in before.views.object_names
         assert "amphora" in model().views.object_names
-
-
-def test_unknown_object_has_no_confidence_anywhere(rig):
-    done = rig("identify", "--json", "--save-run", "runs/unknown", "--set", "bench.sim.object=radio")
-    assert done.exit_code == EXIT_UNKNOWN
-    events = in_json(done)
-    last = [event for event in events if event["event"] == "ranked"][-1]
-    assert max(one["probability"] for one in last["candidates"]) < 0.2 < last["decision"]["not_enrolled"]
-    row = in_json(rig("results", "list", "--json", "--outcome", "unknown"))[-1]
-    assert rig("results", "export", "all.csv", "--outcome", "unknown").exit_code == 0
-    with Path("all.csv").open(newline="") as table:
-        (exported,) = csv.DictReader(table)
-    saved = Path("runs/unknown/events.jsonl").read_text(encoding="utf-8")
-    confidences = [
-        *re.findall(r'"confidence": ([^,}]+)', done.stdout + saved),
-        row["confidence"],
-        exported["confidence"],
-    ]
-    assert confidences == ["null", "null", None, ""]
-    assert rig("report", "runs/unknown").exit_code == 0
-    page = Path("runs/unknown/report.html").read_text(encoding="utf-8")
-    shown = [rig("results", "show", str(row["result"])).stdout, rig("replay", "runs/unknown").stdout, page]
-    assert not any("% confident" in text or "the confidence" in text for text in shown)
-    assert all("ot enrolled with" in text for text in shown[1:])
 
 
 def test_empty_table_is_no_object_with_an_exit_code_of_its_own(rig, monkeypatch):
