@@ -1,10 +1,7 @@
 """`rig demo` with few objects: output, report, reproducibility."""
 
 import json
-import os
 import re
-import shutil
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -131,22 +128,6 @@ def test_demo_rejects_invalid_options_with_a_next_step(arguments, words, tmp_pat
     assert done.exit_code in (2, 3)
     assert words in done.stderr
     assert "Next step:" in done.stderr
-
-
-@pytest.mark.nightly
-def test_photographs_are_enrolled_and_found(tmp_path):
-    coil = Path(os.environ.get("RIG_TEST_DATA", Path(__file__).parents[3] / ".." / "shared" / "data")) / "coil-100"
-    if not coil.is_dir():
-        pytest.skip(f"no photographs at {coil}; set RIG_TEST_DATA")
-    folder = tmp_path / "photographs"
-    folder.mkdir()
-    for number in range(1, 3):
-        for path in coil.glob(f"obj{number}__*.png"):
-            shutil.copy(path, folder)
-    done = demo("--objects", str(folder), "--set", "enroll.views=12", "--out", str(tmp_path / "out"), "--json")
-    result = json.loads(done.stdout)
-    assert (result["found"], result["of"]) == (2, 2)
-    assert [t["object"] for t in result["trials"] if t["enrolled"]] == ["obj1", "obj2"]
 
 
 @pytest.mark.nightly

@@ -284,12 +284,6 @@ def test_events_are_valid_json_without_gyro_values(simulated, catalog):
     assert None in rejected
 
 
-def test_enrollment_ends_with_the_cable_unwound(simulated, catalog):
-    s = simulated()
-    list(enroll(s.bench, catalog, "dice", views=6))
-    assert s.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
-
-
 def test_resume_finishes_an_enrollment_that_has_all_its_views(simulated, catalog):
     s = simulated()
     plan = enroll(s.bench, catalog, "dice", views=4)

@@ -151,18 +151,6 @@ def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(sim
         assert (leading >= 0.95) == (event.reason is RotationReason.NEW_SIDE)
 
 
-def test_one_object_is_found_by_similarity_to_its_own_views(simulated, tmp_path):
-    s = simulated(seed=1)
-    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        list(enroll(s.bench, catalog, "lamp", views=6))
-        model = load_model(catalog)
-    assert isinstance(model.index, hbr.DenseIndex)
-    assert search(s, model, "lamp")[1].name == "lamp"
-    events, answer = search(s, model, "toy-car")
-    assert answer.name is None
-    assert all(e.reason is RotationReason.NEW_SIDE for e in events if isinstance(e, Decided))
-
-
 def test_rotation_of_a_round_object_is_not_stated(simulated, shelf):
     s = simulated()
     s.operator.yaw_deg = 40.0

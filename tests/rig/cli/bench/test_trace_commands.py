@@ -69,15 +69,6 @@ def test_a_register_that_differs_is_named(trace: Rig, monkeypatch: pytest.Monkey
     assert "recorded 640, now 650" in shown.output
 
 
-def test_a_slower_servo_shows_in_angle_and_speed(trace: Rig, monkeypatch: pytest.MonkeyPatch):
-    models = sim.servo.models.MODELS
-    slow = replace(models["xl430_w250"], no_load_dps=30.0)
-    monkeypatch.setattr(sim.servo.models, "MODELS", {**models, "xl430_w250": slow})
-    found = " ".join(differences(trace("servo", "replay", "bench.jsonl", "--json")))
-    assert "servo Present Position" in found
-    assert "servo Present Velocity" in found
-
-
 def test_a_driver_that_reads_other_values_is_noticed(trace: Rig, recorded: bytes):
     before = b'"reply":{"bus_id":1,"error":0,"alert":0,"data":"24042e"'
     assert before in recorded

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import re
 import shutil
 from hashlib import sha256
@@ -115,17 +114,6 @@ def test_report_of_some_objects_searches_among_all(photographs: Path, evaluated:
     assert (whole["reported"], part["reported"]) == (None, [3, 4])
     assert [method["curve"][0]["trials"] for method in part["methods"]] == [4, 4]
     assert part["methods"][0]["pose_rmse_deg_by_object"] == whole["methods"][0]["pose_rmse_deg_by_object"][2:]
-
-
-def test_results_are_written_through_no_link(photographs: Path, evaluated: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (tmp_path / "victim").write_text("mine")
-    for name in ("results.csv", "results.csv.part"):
-        (out / name).symlink_to(tmp_path / "victim")
-    assert run(photographs, QUICK + NOISY, "--out", out).exit_code == 0
-    assert (tmp_path / "victim").read_text() == "mine"
-    assert results(out) == results(evaluated)
 
 
 @pytest.mark.parametrize(
@@ -286,17 +274,6 @@ def test_photographs_that_cannot_be_searched_for_are_rejected(photographs: Path,
     assert words in " ".join(done.stderr.split())
 
 
-def test_other_settings_have_other_folders(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for noise in ("mb:5", "gn:0.01", "mb:5"):  # the last one has the results of the first one
-        done = run(photographs, 'trials = 1\nmax_views = 2\nmethods = "hbr"', "--noise", noise)
-        assert done.exit_code == 0, done.output
-        assert "Written: rig-eval/" in done.stderr
-    names = sorted(path.name for path in Path("rig-eval").iterdir())
-    assert [name.split("-", 2)[2][:-9].split("-", 1)[-1] for name in names] != []
-    assert len(names) == 2
-
-
 def test_orientation_errors_come_from_a_calibration(tmp_path: Path) -> None:
     """The errors are the gyro's rotations minus the encoder's, without the moves that were not valid."""
     legs = [(60.0, 60.5, ""), (-60.0, 59.75, ""), (60.0, 90.0, "stopped")]
@@ -314,12 +291,6 @@ def test_unusable_orientation_errors_are_rejected(tmp_path: Path, content: str) 
     file.write_text(content)
     with pytest.raises(ValueError, match=r"rig calibrate imu"):
         rotation_errors(str(file))
-
-
-def test_a_pipe_with_orientation_errors_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ValueError, match="not a regular file"):
-        rotation_errors(str(tmp_path / "pipe"))
 
 
 def test_experiments_of_the_results_are_shipped(tmp_path: Path) -> None:
