@@ -13,7 +13,7 @@ from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
-from rig.devices.dynamixel.registers import control_table, protocol_of
+from rig.devices.dynamixel.registers import control_table
 from rig.devices.opencv_capture import Capture
 from rig.devices.v4l2 import CAPTURE
 from sim.camera import CAMERA_DEVICE
@@ -228,6 +228,6 @@ def write_files(folder: Path, config: RigConfig) -> None:
 
 def configure_servo(devices: SimDevices, config: ServoConfig) -> None:
     """Write the settings that the rig needs into the servo's EEPROM."""
-    bus = DynamixelBus(ClockedPort(devices.adapter, devices.world.clock), protocol=protocol_of(config.model))
+    bus = DynamixelBus(ClockedPort(devices.adapter, devices.world.clock))
     table = control_table(config.model)
     settings.write(bus, config.id, table, settings.compare(bus, config.id, table))

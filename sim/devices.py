@@ -12,7 +12,6 @@ from rig.config import RigConfig, ServoConfig
 from rig.config.imus import imu_kind
 from rig.core.errors import ConfigError, DeviceNotFound
 from rig.devices.dynamixel.port import READ_SLICE_S
-from rig.devices.dynamixel.registers import protocol_of
 from sim.camera import SimCapture
 from sim.head.board import PinChange, SimHead
 from sim.head.serial_port import HeadSerial
@@ -21,25 +20,18 @@ from sim.imu.inertial import SimulatedImu
 from sim.objects.projection import Image
 from sim.objects.shelf import shelf
 from sim.servo import ServoBus, SimSerial
-from sim.servo.ax12 import AX_12A, Ax12Servo
 from sim.servo.device import XSeriesServo
-from sim.servo.models import servo_model
 from sim.servo.shaft import Geared, Shaft
 from sim.world import SimObject, World
 
-SimulatedServo = XSeriesServo | Ax12Servo
 
-
-def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
+def simulated_servo(world: World, config: ServoConfig) -> XSeriesServo:
     """Return the servo that ``config`` describes, with factory settings, on the table's shaft or behind its gear.
 
     Raises `ConfigError` if there is no simulated servo of that model, or the model does not have the baud rate.
     """
     shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
     try:
-        if protocol_of(config.model) == 1:
-            model = AX_12A if config.model == AX_12A.name else servo_model(config.model)
-            return Ax12Servo(shaft, model, bus_id=config.id, baudrate=config.baud)
         return XSeriesServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
     except ValueError as error:
         raise ConfigError(
@@ -59,7 +51,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
 
     world: World
     servo_bus: ServoBus
-    servo: SimulatedServo
+    servo: XSeriesServo
     adapter: SimSerial
     i2c: SimI2cBus | SimHead
     imu: SimulatedImu
@@ -143,7 +135,7 @@ def _imu(config: RigConfig, world: World) -> SimulatedImu:
     return imu
 
 
-def _head(config: RigConfig, world: World, servo: SimulatedServo) -> SimHead:
+def _head(config: RigConfig, world: World, servo: XSeriesServo) -> SimHead:
     """Return a rig head whose ring light is the only light and whose relay supplies the servo.
 
     Raises `ConfigError` if the firmware cannot be built on this computer.

@@ -135,7 +135,6 @@ def assemble(
         again = reopen_serial and (lambda: traced(reopen_serial()))
         servo = open_servo(traced(connection), config.servo, clock, config.table.mode, again, guardian)
         findings = servo.prepare(write=config.servo.write_settings)
-        findings += tuple(f"servo: {one}" for one in servo.remarks)
         _check_reach(config, servo)
         if note := imu_kind(config.imu.model).note:
             findings += (f"imu: {note}",)

@@ -17,7 +17,7 @@ class ServoConfig(Section):
     id: int = Field(1, ge=0, le=252, description="id on the bus")
     model: str = Field(
         "xl430_w250",
-        description="model of the X, MX (2.0), P or PRO (A) series as in the SDK, ax_12a, or one of a plug-in; "
+        description="model of the X, MX (2.0), P or PRO (A) series as in the SDK, or one of a plug-in; "
         "`rig find` names yours",
     )
     gear_ratio: float = Field(

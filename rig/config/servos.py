@@ -15,36 +15,22 @@ from typing import Any, Final
 
 GROUP = "rig.servos"
 """Entry-point group in which packages name a `DynamixelModel`, or a `rig.devices.servo.ServoDriver`."""
-USE_ANOTHER = "Use a servo of the X series, the MX series (2.0), the P series or the PRO series (A), or an AX-12A"
-USE_PROTOCOL_2 = (
-    "Install the firmware of the model whose name ends with (2.0) with DYNAMIXEL Wizard 2.0 (Firmware Recovery)"
-)
+USE_ANOTHER = "Use a servo of the X series, the MX series (2.0), the P series or the PRO series (A)"
 
 _PACKAGE, _FOLDER = "dynamixel_easy_sdk", "control_table"
 # Names that differ between the .model files and the e-manual.
 _RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdog"}
 _UNLISTED: Final = {1280: "xw430_t200"}  # e-manual, XW430-T200: the SDK has its file, but not its number
 
-FACTORY_PROTOCOL_1: Final = {29: "mx_28", 310: "mx_64", 320: "mx_106"}
-"""Model Numbers with the factory's firmware for Protocol 1.0 (e-manual, MX series); with that for 2.0 it is another."""
-
-# The registers that the driver uses, by protocol. With Protocol 2.0 also the load: see `DynamixelModel.missing`.
-_USED: Final = {
-    2: (
-        *("Model Number", "Firmware Version", "ID", "Baud Rate", "Return Delay Time", "Drive Mode", "Operating Mode"),
-        *("Secondary ID", "Homing Offset", "Temperature Limit", "Max Voltage Limit", "Min Voltage Limit"),
-        *("Velocity Limit", "Max Position Limit", "Min Position Limit", "Shutdown", "Torque Enable"),
-        *("Status Return Level", "Hardware Error Status", "Bus Watchdog", "Profile Acceleration", "Profile Velocity"),
-        *("Goal Position", "Realtime Tick", "Moving", "Moving Status", "Present Velocity", "Present Position"),
-        *("Position Trajectory", "Present Input Voltage", "Present Temperature"),
-    ),
-    1: (
-        *("Model Number", "Firmware Version", "ID", "Baud Rate", "Return Delay Time", "CW Angle Limit"),
-        *("CCW Angle Limit", "Temperature Limit", "Min Voltage Limit", "Max Voltage Limit", "Status Return Level"),
-        *("Shutdown", "Torque Enable", "Goal Position", "Moving Speed", "Present Position", "Present Speed"),
-        *("Present Load", "Present Voltage", "Present Temperature", "Moving"),
-    ),
-}
+# The registers that the driver uses; also the load: see `DynamixelModel.missing`.
+_USED: Final = (
+    *("Model Number", "Firmware Version", "ID", "Baud Rate", "Return Delay Time", "Drive Mode", "Operating Mode"),
+    *("Secondary ID", "Homing Offset", "Temperature Limit", "Max Voltage Limit", "Min Voltage Limit"),
+    *("Velocity Limit", "Max Position Limit", "Min Position Limit", "Shutdown", "Torque Enable"),
+    *("Status Return Level", "Hardware Error Status", "Bus Watchdog", "Profile Acceleration", "Profile Velocity"),
+    *("Goal Position", "Realtime Tick", "Moving", "Moving Status", "Present Velocity", "Present Position"),
+    *("Position Trajectory", "Present Input Voltage", "Present Temperature"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +39,13 @@ class DynamixelModel:
 
     ``name`` is the value of ``servo.model``, ``number`` its Model Number. ``registers`` are address, size and e-manual
     name of each register. ``zero_counts`` is the middle of a revolution. ``extended_counts`` is the largest goal in
-    each direction in extended position mode, 0 if the model counts no revolutions. ``most_units`` limits a speed or an
+    each direction in extended position mode. ``most_units`` limits a speed or an
     acceleration for which the model has no register with a limit. ``dps2_per_unit`` is the unit of
-    Profile Acceleration; a model without this register always accelerates at this rate.
+    Profile Acceleration.
     """
 
     name: str
     number: int
-    protocol: int
     registers: tuple[tuple[int, int, str], ...]
     deg_per_count: float = 0.0
     zero_counts: int = 0
@@ -86,7 +71,9 @@ class DynamixelModel:
         """Return the registers and units that the driver uses and the row lacks."""
         names = {name for _, _, name in self.registers}
         units = {"Goal Position": self.deg_per_count, "speed": self.dps_per_unit, "acceleration": self.dps2_per_unit}
-        lacks = [name for name in _USED[self.protocol] if name not in names]
+        lacks = [name for name in _USED if name not in names]
+        if not self.extended_counts:
+            lacks.append("the range of Goal Position in extended position mode")
         if not self.most_units and "Acceleration Limit" not in names:
             lacks.append("Acceleration Limit")
         if "Present Current" in names:
@@ -114,51 +101,6 @@ _SERIES: Final[dict[tuple[str, ...], dict[str, Any]]] = {
     },
 }
 
-AX_12A = DynamixelModel(  # e-manual, AX-12A; the SDK has no file of it. No value is signed: bit 10 is the direction.
-    "ax_12a",
-    12,
-    1,
-    (
-        (0, 2, "Model Number"),
-        (2, 1, "Firmware Version"),
-        (3, 1, "ID"),
-        (4, 1, "Baud Rate"),
-        (5, 1, "Return Delay Time"),
-        (6, 2, "CW Angle Limit"),
-        (8, 2, "CCW Angle Limit"),
-        (11, 1, "Temperature Limit"),
-        (12, 1, "Min Voltage Limit"),
-        (13, 1, "Max Voltage Limit"),
-        (14, 2, "Max Torque"),
-        (16, 1, "Status Return Level"),
-        (17, 1, "Alarm LED"),
-        (18, 1, "Shutdown"),
-        (24, 1, "Torque Enable"),
-        (25, 1, "LED"),
-        (26, 1, "CW Compliance Margin"),
-        (27, 1, "CCW Compliance Margin"),
-        (28, 1, "CW Compliance Slope"),
-        (29, 1, "CCW Compliance Slope"),
-        (30, 2, "Goal Position"),
-        (32, 2, "Moving Speed"),
-        (34, 2, "Torque Limit"),
-        (36, 2, "Present Position"),
-        (38, 2, "Present Speed"),
-        (40, 2, "Present Load"),
-        (42, 1, "Present Voltage"),
-        (43, 1, "Present Temperature"),
-        (44, 1, "Registered"),
-        (46, 1, "Moving"),
-        (47, 1, "Lock"),
-        (48, 2, "Punch"),
-    ),
-    deg_per_count=300.0 / 1023,
-    zero_counts=512,
-    most_units=1023,
-    dps_per_unit=0.111 * 6.0,
-    dps2_per_unit=2000.0,  # its fastest acceleration, estimated from its 354 °/s, because no document states it
-)
-
 
 def model_file_exists(name: str) -> bool:
     """Return whether the SDK has a file of this name."""
@@ -167,27 +109,26 @@ def model_file_exists(name: str) -> bool:
 
 @cache
 def model_numbers() -> Mapping[int, str]:
-    """Return the models of the SDK, and the AX-12A, by their Model Number."""
+    """Return the models of the SDK by their Model Number."""
     listed = {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel", "")}
-    return {**listed, **_UNLISTED, AX_12A.number: AX_12A.name}
+    return {**listed, **_UNLISTED}
 
 
 @cache
 def known_model(name: str, file: str = "") -> DynamixelModel | None:
-    """Return the row of a model of the SDK, or of the AX-12A; None for other names.
+    """Return the row of a model of the SDK; None for other names.
 
     ``file`` is another `.model` file of the same model.
     """
     number = next((number for number, known in model_numbers().items() if known == name), None)
-    if number is None or name == AX_12A.name:
-        return None if number is None else AX_12A
+    if number is None:
+        return None
     kind = {row[0]: float(row[1]) for row in _rows(file or name, "type info")}
     units = {row[0]: float(row[1]) for row in _rows(file or name, "unit info")}
     zero, low = kind["value_of_zero_radian_position"], kind["value_of_min_radian_position"]
     return DynamixelModel(
         name,
         number,
-        2,
         tuple((int(row[0]), int(row[1]), _RENAMED.get(row[2], row[2])) for row in _rows(file or name, "control table")),
         # The highest position is not a whole revolution in all files. -min_radian is rounded to eight digits.
         deg_per_count=360.0 / round((zero - low) * 2 * pi / -kind["min_radian"]),

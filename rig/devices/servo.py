@@ -80,10 +80,6 @@ class ServoLimits:
 class Servo(Protocol):
     """A position servo that rotates the table."""
 
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Notes for the operator about this model."""
-
     def prepare(self, *, write: bool) -> tuple[str, ...]:
         """Compare the servo's permanent settings with the required ones; return the changes.
 

@@ -22,10 +22,7 @@ from rig.doctor.finding import Finding, FindingCode, bad
 
 # a scan of all takes long, so the usual ones come first
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
-"""Baud rates of Protocol 2.0: the factory setting first, then in order of frequency."""
-BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9_600)  # the same for Protocol 1.0
-
-_ANSWER_1_S = 0.02  # time for an answer of a servo of Protocol 1.0 and its adapter; each id is asked separately
+"""Baud rates: the factory setting first, then in order of frequency."""
 _PING_ANSWER = 14
 _LISTEN_S = 0.05  # longer than an answer at the lowest rate; only a device that talks by itself sends in this time
 # two servos with one id collide in most readings, a bad cable in few: more than half of these tells them apart
@@ -39,7 +36,6 @@ class FoundServo:
 
     bus_id: int
     baud: int
-    protocol: int
     model: str | None
     model_number: int
     firmware: int
@@ -50,7 +46,7 @@ class FoundServo:
 
     def __str__(self) -> str:
         name = self.model.replace("_", "-").upper() if self.model else f"unknown model {self.model_number}"
-        return f"{name}, firmware {self.firmware}, id {self.bus_id} at {self.baud} baud (protocol {self.protocol}.0)"
+        return f"{name}, firmware {self.firmware}, id {self.bus_id} at {self.baud} baud"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +58,6 @@ class BaudScan:
     """
 
     baud: int
-    protocol: int
     servos: tuple[FoundServo, ...] = ()
     duplicate_ids: tuple[int, ...] = ()
     noise: bool = False
@@ -72,12 +67,10 @@ class BaudScan:
         return bool(self.servos or self.duplicate_ids)
 
 
-def scan_servos(
-    wire: SerialConnection, clock: Clock, bauds: Sequence[int] = BAUD_RATES, *, protocol: int = 2
-) -> Iterator[BaudScan]:
+def scan_servos(wire: SerialConnection, clock: Clock, bauds: Sequence[int] = BAUD_RATES) -> Iterator[BaudScan]:
     """Scan each baud rate and yield the answers; afterwards the port has its old baud rate again.
 
-    Takes about one second per baud rate, four at 9,600 baud, and five with Protocol 1.0.
+    Takes about one second per baud rate, four at 9,600 baud.
 
     Raises `serial.SerialException`, `OSError`: the adapter was unplugged.
     """
@@ -89,7 +82,7 @@ def scan_servos(
                 port.setBaudRate(baud)
             except (ValueError, NotImplementedError):  # the adapter does not support this rate
                 continue
-            yield _scan_2(port, baud) if protocol == 2 else _scan_1(port, baud)
+            yield _scan(port, baud)
     finally:
         with suppress(serial.SerialException, OSError, ValueError):
             wire.baudrate = before
@@ -111,10 +104,10 @@ def corrupt_reads(bus: DynamixelBus, bus_id: int, model: str | None = None) -> i
     corrupt = 0
     row = model_row(model) if model else None
     places = {name: address for address, _, name in row.registers} if row else {}
-    address, size = (places.get(_STATUS, 120), _STATUS_SIZE) if bus.protocol == 2 else (36, 8)
+    address = places.get(_STATUS, 120)
     for _ in range(_STATUS_READS):
         try:
-            bus.read_block(bus_id, address, size)
+            bus.read_block(bus_id, address, _STATUS_SIZE)
         except RequestRejected:
             continue
         except DeviceSilent:
@@ -122,16 +115,16 @@ def corrupt_reads(bus: DynamixelBus, bus_id: int, model: str | None = None) -> i
     return corrupt
 
 
-def _scan_2(port: ClockedPort, baud: int) -> BaudScan:
+def _scan(port: ClockedPort, baud: int) -> BaudScan:
     listening = _Recording(port)
     try:
         answers, _ = Protocol2PacketHandler().broadcastPing(listening)
     except BusBabble:
-        return BaudScan(baud, 2, noise=True)
+        return BaudScan(baud, noise=True)
     port.drain()
     if _babbles(port):
-        return BaudScan(baud, 2, noise=True)
-    servos = [_servo(bus_id, baud, 2, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
+        return BaudScan(baud, noise=True)
+    servos = [_servo(bus_id, baud, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
     bus = DynamixelBus(port, retries=0)
     duplicate_ids = [
         servo.bus_id for servo in servos if corrupt_reads(bus, servo.bus_id, servo.model) > _STATUS_READS // 2
@@ -145,9 +138,9 @@ def _scan_2(port: ClockedPort, baud: int) -> BaudScan:
         except (RequestRejected, DeviceSilent):
             duplicate_ids += [bus_id] if _answers_corrupt(bus, bus_id) else []
         else:  # its answer to the broadcast was corrupt, this one is not
-            servos.append(_servo(bus_id, baud, 2, int.from_bytes(head[:2], "little"), head[6]))
+            servos.append(_servo(bus_id, baud, int.from_bytes(head[:2], "little"), head[6]))
     sound = tuple(servo for servo in servos if servo.bus_id not in duplicate_ids)
-    return BaudScan(baud, 2, sound, tuple(sorted(duplicate_ids)), bool(rest) and not duplicate_ids and not sound)
+    return BaudScan(baud, sound, tuple(sorted(duplicate_ids)), bool(rest) and not duplicate_ids and not sound)
 
 
 class _Recording(ClockedPort):
@@ -172,26 +165,6 @@ class _Recording(ClockedPort):
         return data
 
 
-def _scan_1(port: ClockedPort, baud: int) -> BaudScan:
-    if _babbles(port):
-        return BaudScan(baud, 1, noise=True)
-    servos = []
-    duplicate_ids = []
-    bus = DynamixelBus(_ShortTimeout(port), retries=0, protocol=1)
-    for bus_id in range(253):
-        corrupt = bus.statistics.corrupt
-        try:
-            head = bus.read_block(bus_id, 0, 3)
-        except RequestRejected:
-            continue
-        except DeviceSilent:
-            if bus.statistics.corrupt > corrupt and _answers_corrupt(bus, bus_id):
-                duplicate_ids.append(bus_id)
-            continue
-        servos.append(_servo(bus_id, baud, 1, int.from_bytes(head[:2], "little"), head[2]))
-    return BaudScan(baud, 1, tuple(servos), tuple(duplicate_ids))
-
-
 def _babbles(port: ClockedPort) -> bool:
     """Return whether bytes come without a request: they would make every id seem to answer."""
     end_ns = port.clock.now_ns() + round(_LISTEN_S * 1e9)
@@ -201,18 +174,8 @@ def _babbles(port: ClockedPort) -> bool:
     return False
 
 
-class _ShortTimeout(ClockedPort):
-    """A port with the shortest sufficient timeout for an answer."""
-
-    def __init__(self, port: ClockedPort) -> None:
-        super().__init__(port.ser, port.clock)
-
-    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802 - the SDK's name
-        self.setPacketTimeoutMillis(packet_length * self.tx_time_per_byte + 1e3 * _ANSWER_1_S)
-
-
-def _servo(bus_id: int, baud: int, protocol: int, number: int, firmware: int) -> FoundServo:
-    return FoundServo(bus_id, baud, protocol, model_of(number), number, firmware)
+def _servo(bus_id: int, baud: int, number: int, firmware: int) -> FoundServo:
+    return FoundServo(bus_id, baud, model_of(number), number, firmware)
 
 
 def _answers_corrupt(bus: DynamixelBus, bus_id: int) -> bool:

@@ -1,6 +1,6 @@
 """Find the devices that are connected to the computer, and their settings for the configuration."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +22,6 @@ from rig.devices.picamera2_capture import import_picamera2
 from rig.devices.v4l2 import VideoMode, choose_mode
 from rig.doctor.bus_scan import (
     BAUD_RATES,
-    BAUD_RATES_1,
     BaudScan,
     FoundImu,
     FoundServo,
@@ -130,7 +129,7 @@ class DeviceScan:
             yield from self._on_port(context, port)
 
     def _on_port(self, context: DoctorContext, port: SerialPort) -> Iterator[Finding | str]:
-        """Scan a port, the fast scans first: the ids of AX-12A can only be asked one by one."""
+        """Scan a port for servos, then for a rig head."""
         if problems := [finding for finding in access(context, "servo", port, "dialout") if finding.fix]:
             yield from problems
             return
@@ -138,10 +137,8 @@ class DeviceScan:
             port.path, context.config.head.port
         )
         try:
-            servos = False if known_head else (yield from self._servos(context, port, 2, BAUD_RATES))
+            servos = False if known_head else (yield from self._servos(context, port))
             head = False if servos else (yield from self._head(context, port))
-            if not (head or known_head or servos):
-                servos = (yield from self._servos(context, port, 1, BAUD_RATES_1)) or servos
         except DeviceNotFound as error:
             yield of_error("servo", error)
         except (serial.SerialException, OSError) as error:
@@ -152,14 +149,12 @@ class DeviceScan:
                 fix = ("Check the servo's cable and switch on its supply, then", Do.FIND())
                 yield warning("servo", FindingCode.NOTHING_ON_PORT, fix, port=port.path, name=port.name)
 
-    def _servos(
-        self, context: DoctorContext, port: SerialPort, protocol: int, rates: Sequence[int]
-    ) -> Generator[Finding | str, None, bool]:
+    def _servos(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
         answered: list[BaudScan] = []
-        with closing(context.computer.open_serial(port.path, rates[0])) as wire:
-            for rate in rates:
-                yield f"{port.path}: scanning at {rate} baud, protocol {protocol}.0 ..."
-                answered += scan_servos(wire, context.computer.clock, [rate], protocol=protocol)
+        with closing(context.computer.open_serial(port.path, BAUD_RATES[0])) as wire:
+            for rate in BAUD_RATES:
+                yield f"{port.path}: scanning at {rate} baud ..."
+                answered += scan_servos(wire, context.computer.clock, [rate])
         for scan in without_echoes(answered, context.config.servo.baud):
             yield from self._found(port, scan)
         return any(scan.answered for scan in answered)

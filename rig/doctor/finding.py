@@ -66,7 +66,6 @@ class FindingCode(Enum):
     # servo
     SUPPLY_SWITCHED = "not checked: the rig head's relay switches its supply on only while a program runs"
     SERVO = "{model}, firmware {firmware}, id {id} at {baud} baud, {port}"
-    SERVO_LIMITATION = "{remark}"
     NO_SERVO = "no servo answers at id {id}, {baud} baud, {port}, nor any other at any baud rate"
     OTHER_SERVOS = "no servo answers at id {id}, {baud} baud, {port} (found: {found})"
     ONLY_SERVO = "the only servo on its bus"

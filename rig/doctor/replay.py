@@ -16,10 +16,9 @@ from rig.config import RigConfig
 from rig.core.clock import Clock, SystemClock, seconds_between
 from rig.core.errors import RequestRejected, RigError
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.packets import PING, READ, WRITE, Reply
-from rig.devices.dynamixel.port import READ_SLICE_S, BusBabble, ClockedPort, SerialConnection
-from rig.devices.dynamixel.registers import ControlTable, control_table, protocol_of
-from rig.devices.dynamixel.servo import NAMES
+from rig.devices.dynamixel.packets import PING, READ, WRITE, Packets, Reply
+from rig.devices.dynamixel.port import READ_SLICE_S, BusBabble, ClockedPort
+from rig.devices.dynamixel.registers import ControlTable, control_table
 from rig.devices.head.link import Deframer, HeadStatistics
 from rig.devices.i2c import I2cBus
 from rig.devices.imu import open_imu
@@ -34,7 +33,7 @@ _TOLERANCES: Final = {
 }
 """How much registers may differ that measure something; angles and speeds depend on the model."""
 _ANGLES: Final = ("Present Position", "Position Trajectory")
-_RATES: Final = ("Present Velocity", "Present Speed", "Velocity Trajectory")
+_RATES: Final = ("Present Velocity", "Velocity Trajectory")
 _SWITCHING: Final = ("Moving", "Moving Status")
 """Registers that change at a moment: one reading earlier or later is no difference."""
 _OF_THE_BUS: Final = ("ID", "Baud Rate", "Secondary ID", "Protocol Type")
@@ -85,7 +84,7 @@ def replay_drivers(trace: Trace) -> Replay:
     """Let the drivers read the recorded bytes; compare what they understand with what they understood then."""
     result, clock = Replay(), _TraceClock()
     port = _PlayedPort(clock, result)
-    for request, reply in _ask(_bus(port, clock, trace.config), clock, _requests(trace), result, port.begin):
+    for request, reply in _ask(DynamixelBus(ClockedPort(port, clock)), clock, _requests(trace), result, port.begin):
         result.compare("servo reply", request.t_ns, request.reply, reply)
     notes = trace.notes("imu")
     if "samples" in notes and trace.config.imu.connection == "i2c":
@@ -109,7 +108,7 @@ def replay_devices(trace: Trace, computer: Computer) -> Replay:
     result, config, clock = Replay(), trace.config, computer.clock
     if requests := _requests(trace):
         with closing(computer.open_serial(config.servo.port, config.servo.baud)) as connection:
-            servo = _Servo(_bus(connection, clock, config), config, requests)
+            servo = _Servo(DynamixelBus(ClockedPort(connection, clock)), config, requests)
             servo.set_up(clock)
             for request, reply in _ask(servo.bus, clock, requests, result):
                 servo.compare(result, request, reply)
@@ -140,7 +139,7 @@ class _Request:
 
 
 def _requests(trace: Trace) -> list[_Request]:
-    packets = _bus(_PlayedPort(_TraceClock(), Replay()), _TraceClock(), trace.config).packets
+    packets = Packets()
     requests: list[_Request] = []
     for event in trace.of("servo"):
         if event.write is not None:
@@ -151,10 +150,6 @@ def _requests(trace: Trace) -> list[_Request]:
         elif event.reply is not None and requests:
             requests[-1].reply, requests[-1].reply_ms = event.reply, (event.t_ns - requests[-1].t_ns) * 1e-6
     return requests
-
-
-def _bus(connection: SerialConnection, clock: Clock, config: RigConfig) -> DynamixelBus:
-    return DynamixelBus(ClockedPort(connection, clock), protocol=protocol_of(config.servo.model))
 
 
 def _ask(
@@ -182,9 +177,8 @@ def _ask(
 
 
 def _block(parameters: bytes) -> tuple[int, int]:
-    """Return address and size in the parameters of a read; both have one byte in protocol 1, and two in 2."""
-    half = len(parameters) // 2
-    return int.from_bytes(parameters[:half], "little"), int.from_bytes(parameters[half:], "little")
+    """Return address and size in the parameters of a read."""
+    return int.from_bytes(parameters[:2], "little"), int.from_bytes(parameters[2:], "little")
 
 
 class _Servo:
@@ -221,7 +215,7 @@ class _Servo:
         recorded, t_ns = request.reply, request.t_ns
         _, kind, parameters = request.instruction
         if kind == WRITE:
-            self._written.add(int.from_bytes(parameters[: self.bus.protocol], "little"))
+            self._written.add(int.from_bytes(parameters[:2], "little"))
         if recorded is None or reply is None:
             result.compare("servo answer", t_ns, recorded and recorded.data.hex(), reply and reply.data.hex())
             return
@@ -242,7 +236,7 @@ class _Servo:
         return {name: value for one in reversed(answered) for name, value in self._values(*one)}
 
     def _values(self, request: _Request, reply: Reply) -> Iterator[tuple[str, int]]:
-        """Yield the registers in the reply to a read, and to a ping in protocol 2."""
+        """Yield the registers in the reply to a read and to a ping."""
         _, kind, parameters = request.instruction
         if reply.error or kind not in (READ, PING):
             return
@@ -251,8 +245,7 @@ class _Servo:
             at = register.address - start
             # After the Model Number, a ping reports the firmware, which has another address.
             if 0 <= at <= len(reply.data) - register.size and (kind == READ or at == 0):
-                value = register.decode(reply.data[at : at + register.size])
-                yield name, NAMES[self.bus.protocol].signed(value) if name in (*_RATES, "Present Load") else value
+                yield name, register.decode(reply.data[at : at + register.size])
 
     def _write(self, name: str, value: int) -> None:
         with suppress(RequestRejected):

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from rig.config import ServoConfig
-from rig.config.servos import FACTORY_PROTOCOL_1, DynamixelModel
+from rig.config.servos import DynamixelModel
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do, SomeSteps
@@ -14,12 +14,11 @@ from rig.devices.dynamixel.registers import (
     control_table,
     model_of,
     obstacle,
-    protocol_of,
     servo_plugin,
 )
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
-from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
 
@@ -66,9 +65,6 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
         context.identities["servo"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         name = identity.model.replace("_", "-").upper()
         yield fine("servo", FindingCode.SERVO, model=name, firmware=identity.firmware, **_place(config))
-        for remark in found.remarks:
-            fix = "Stay at the bench, or use a servo of the X series"
-            yield warning("servo", FindingCode.SERVO_LIMITATION, fix, remark=remark)
         if isinstance(found, DynamixelServo):
             yield from _others_on_bus(context, wire)
             yield from _settings(found)
@@ -80,15 +76,10 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
 def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding | str]:
     """Scan the other baud rates, because the configured servo does not answer."""
     config = context.config.servo
-    protocol = protocol_of(config.model)
-    rates = BAUD_RATES if protocol == 2 else BAUD_RATES_1
-    asked = [(protocol, rate) for rate in (config.baud, *(rate for rate in rates if rate != config.baud))]
-    if config.model in FACTORY_PROTOCOL_1.values():
-        asked += [(1, rate) for rate in BAUD_RATES_1]
     answered: list[BaudScan] = []
-    for protocol, rate in asked:
+    for rate in (config.baud, *(rate for rate in BAUD_RATES if rate != config.baud)):
         yield f"{config.port}: no servo at id {config.id}; scanning at {rate} baud ..."
-        for scan in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
+        for scan in scan_servos(wire, context.computer.clock, [rate]):
             if scan.duplicate_ids:
                 yield duplicate_id(config.port, scan)
                 return
@@ -121,8 +112,6 @@ def _use(config: ServoConfig, there: FoundServo) -> SomeSteps:
 def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding]:
     """Find other servos at this baud rate, and servos with the same id."""
     config = context.config.servo
-    if protocol_of(config.model) == 1:
-        return  # Protocol 1.0 has no broadcast ping: `rig find` asks each id
     for scan in scan_servos(wire, context.computer.clock, [config.baud]):
         others = [servo for servo in scan.servos if servo.bus_id != config.id]
         if scan.duplicate_ids:

@@ -11,12 +11,11 @@ from rig.core.next_steps import Do
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import ControlTable, control_table, require_driven
-from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
 
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
-"""Values of Baud Rate, Protocol 2.0 (e-manual)."""
-AX_BAUD = 2_000_000  # Protocol 1.0: the value of Baud Rate is this number divided by the rate, minus one
+"""Values of Baud Rate (e-manual)."""
 MAX_ID = 252  # 253 is reserved, and 254 is the broadcast
 _SETTLE_S = 0.05  # time that a servo needs before it answers at a new rate
 
@@ -37,7 +36,7 @@ class SingleServo:
         require_driven(self.found.model_number, self.found.bus_id)
         assert self.found.model is not None
         wire.baudrate = self.found.baud
-        self.bus = DynamixelBus(ClockedPort(wire, self._clock), protocol=self.found.protocol)
+        self.bus = DynamixelBus(ClockedPort(wire, self._clock))
         self.table: ControlTable = control_table(self.found.model, self.found.firmware)
 
     def set_id(self, new: int) -> None:
@@ -113,11 +112,6 @@ class SingleServo:
 
 def baud_codes(table: ControlTable) -> dict[int, int]:
     """Return the baud rates that a model can be set to, each with its register value."""
-    if table.row.protocol == 1:
-        return {
-            rate: round(AX_BAUD / rate) - 1
-            for rate in (9_600, 19_200, 57_600, 115_200, 200_000, 250_000, 500_000, 1_000_000)
-        }
     fastest = 4_000_000 if table.row.name.startswith(("xl330", "xc330")) else 4_500_000
     return {rate: code for rate, code in BAUD_CODES.items() if rate <= fastest}
 
@@ -136,22 +130,18 @@ def single_servo(context: DoctorContext, progress: Callable[[str], None] = lambd
 
 def _find_only_servo(context: DoctorContext, wire: SerialConnection, progress: Callable[[str], None]) -> FoundServo:
     """Scan all baud rates: a second servo at another rate would answer as soon as the rates are equal."""
-    found: list[FoundServo] = []
-    for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
-        if protocol == 1 and found:
-            break
-        scans: list[BaudScan] = []
-        for rate in rates:
-            progress(f"{context.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
-            for scan in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
-                scans.append(scan)
-                if scan.duplicate_ids:
-                    raise SeveralServos(
-                        f"Two servos answer at once to id {', '.join(map(str, scan.duplicate_ids))} at {rate} baud.",
-                        next_step="Unplug all other servos, then try again.",
-                        evidence={"ids": list(scan.duplicate_ids), "baud": rate},
-                    )
-        found = [servo for scan in without_echoes(scans, context.config.servo.baud) for servo in scan.servos]
+    scans: list[BaudScan] = []
+    for rate in BAUD_RATES:
+        progress(f"{context.config.servo.port}: asking at {rate} baud ...")
+        for scan in scan_servos(wire, context.computer.clock, [rate]):
+            scans.append(scan)
+            if scan.duplicate_ids:
+                raise SeveralServos(
+                    f"Two servos answer at once to id {', '.join(map(str, scan.duplicate_ids))} at {rate} baud.",
+                    next_step="Unplug all other servos, then try again.",
+                    evidence={"ids": list(scan.duplicate_ids), "baud": rate},
+                )
+    found = [servo for scan in without_echoes(scans, context.config.servo.baud) for servo in scan.servos]
     if not found:
         raise DeviceNotFound(
             f"No servo answers on {context.config.servo.port} at any baud rate.",

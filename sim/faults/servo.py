@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.devices import SimDevices, SimulatedServo
+from sim.devices import SimDevices
 from sim.faults.kind import Delay, End, Parameter, repeatedly, share, simulated_fault
-from sim.servo import Ax12Servo, SentBytes, XSeriesServo
-from sim.servo.base import OVERLOAD_ERROR
+from sim.servo import SentBytes, XSeriesServo
 from sim.servo.control_table import Memory
+from sim.servo.device import OVERLOAD_ERROR
 from sim.world import World
 
 Values = Mapping[str, float]
@@ -159,11 +159,7 @@ def _unplug(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> 
 def _duplicate_id(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
     first = devices.servo
     world = World(noise=devices.world.noise, seed=devices.world.seed + 1, clock=devices.world.clock)
-    twin: SimulatedServo
-    if isinstance(first, XSeriesServo):
-        twin = XSeriesServo(world, first.model.name, bus_id=first.bus_id, baudrate=first.baudrate)
-    else:
-        twin = Ax12Servo(world, bus_id=first.bus_id, baudrate=first.baudrate)
+    twin = XSeriesServo(world, first.model.name, bus_id=first.bus_id, baudrate=first.baudrate)
     devices.servo_bus.attach(twin)
     return lambda: devices.servo_bus.detach(twin)
 

@@ -31,7 +31,7 @@ from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
 from sim.realtime.server import BenchServer
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, HEAD, SERVO, SOCKET, STATE
-from sim.servo.base import BOOT_S
+from sim.servo.device import BOOT_S
 
 LOCK = "lock"
 

@@ -3,20 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import takewhile
 from typing import Protocol
 
 from sim.clock import VirtualClock
-from sim.servo.protocol1 import PacketParser1, status_packet1
-from sim.servo.protocol2 import (
-    BROADCAST_ID,
-    InstructionPacket,
-    PacketParser,
-    StatusPacket,
-    fast_status_parts,
-    status_packet,
-)
-from sim.servo.requests import CHAINED_READS, FAST_READS, chained_reads
+from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, StatusPacket, status_packet
 
 BITS_PER_BYTE = 10  # a start bit, 8 data bits, a stop bit
 ABANDON_S = 0.05  # silence after which a device drops an incomplete packet; the e-manual states no value
@@ -55,21 +45,8 @@ class SentBytes:
         return self.arrival_ns(len(self.data))
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceAnswer:
-    """The answer of a device, with its id and its delay."""
-
-    bus_id: int
-    delay_ns: int
-    status: StatusPacket
-
-
 class BusDevice(Protocol):
     """The interface of a servo on the bus."""
-
-    @property
-    def protocol(self) -> int:
-        """Its protocol: 1 or 2."""
 
     @property
     def bus_id(self) -> int: ...
@@ -86,9 +63,8 @@ class ServoBus:
     """Servos on one bus, and the host's adapter.
 
     An instruction reaches the devices when its last byte has arrived. An answer begins after the device's Return Delay
-    Time, in a chained read after the previous answer (all devices after a silent one are silent, too). A device with
-    another baud rate than the host receives nothing. The answers of two devices with one id collide. Bytes of the host
-    do not collide with the answer of a device here.
+    Time. A device with another baud rate than the host receives nothing. The answers of two devices with one id
+    collide. Bytes of the host do not collide with the answer of a device here.
 
     Attributes
     ----------
@@ -112,7 +88,7 @@ class ServoBus:
         self._devices: list[BusDevice] = []
         self._deliver: Callable[[SentBytes], None] | None = None
         self._sent_until_ns = 0
-        self._parsers: dict[int, PacketParser] = {1: PacketParser1(), 2: PacketParser()}
+        self._parser = PacketParser()
         self._last_frame = SentBytes(Sender.HOST, 0, 1, b"")
 
     def attach(self, device: BusDevice) -> None:
@@ -152,57 +128,24 @@ class ServoBus:
 
     def _receive(self, frame: SentBytes) -> None:
         if frame.baudrate != self._last_frame.baudrate or frame.start_ns - self._last_frame.end_ns > ABANDON_S * 1e9:
-            for parser in self._parsers.values():
-                parser.reset()
+            self._parser.reset()
         self._last_frame = frame
-        for protocol, parser in self._parsers.items():
-            for packet in parser.feed(frame.data):
-                self._dispatch(packet, frame.baudrate, protocol)
+        for packet in self._parser.feed(frame.data):
+            self._dispatch(packet, frame.baudrate)
 
-    def _dispatch(self, packet: InstructionPacket, baudrate: int, protocol: int) -> None:
+    def _dispatch(self, packet: InstructionPacket, baudrate: int) -> None:
         # Ids and delays are those before the instruction; its changes apply from the next instruction.
-        called = [
-            (d, d.bus_id, d.return_delay_ns)
-            for d in self._devices
-            if d.powered and d.baudrate == baudrate and d.protocol == protocol
-        ]
-        answers = [
-            DeviceAnswer(bus_id, delay_ns, status)
+        called = [(d, d.bus_id, d.return_delay_ns) for d in self._devices if d.powered and d.baudrate == baudrate]
+        now_ns, slot_ns = self.clock.now_ns(), 0
+        if packet.bus_id == BROADCAST_ID:  # only a ping is answered then
+            slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
+        frames = [
+            SentBytes(Sender.DEVICE, now_ns + delay_ns + bus_id * slot_ns, baudrate, status_packet(bus_id, status))
             for device, bus_id, delay_ns in called
             if (status := device.execute(packet)) is not None
         ]
-        if protocol == 2 and packet.instruction in CHAINED_READS:
-            frames = self._chain(packet, answers, baudrate)
-        else:
-            packed, slot_ns, now_ns = (status_packet1 if protocol == 1 else status_packet), 0, self.clock.now_ns()
-            if protocol == 2 and packet.bus_id == BROADCAST_ID:  # only a ping is answered then
-                slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
-            frames = [
-                SentBytes(Sender.DEVICE, now_ns + a.delay_ns + a.bus_id * slot_ns, baudrate, packed(a.bus_id, a.status))
-                for a in answers
-            ]
         for frame in superpose(frames):
             self._reply(frame)
-
-    def _chain(self, packet: InstructionPacket, answers: list[DeviceAnswer], baudrate: int) -> list[SentBytes]:
-        """Return the answers to a chained read: one after the other; a fast read gives one packet."""
-        requests = chained_reads(packet)
-        links = ([answer for answer in answers if answer.bus_id == bus_id] for bus_id in requests)
-        chain = list(takewhile(bool, links))
-        fast = packet.instruction in FAST_READS
-        parts = [b""] * len(chain)
-        if fast:  # without parts, because they need more than one packet, the devices stay silent
-            sizes = [size for _, size in requests.values()]
-            parts = fast_status_parts(sizes, [(link[0].bus_id, link[0].status) for link in chain])
-        frames: list[SentBytes] = []
-        free_ns = self.clock.now_ns()
-        for link, part in zip(chain, parts, strict=False):
-            for answer in link:
-                start_ns = free_ns if fast and frames else free_ns + answer.delay_ns
-                data = part if fast else status_packet(answer.bus_id, answer.status)
-                frames.append(SentBytes(Sender.DEVICE, start_ns, baudrate, data))
-            free_ns = max(frame.end_ns for frame in frames)
-        return frames
 
     def _reply(self, frame: SentBytes) -> None:
         for change in self.filters:

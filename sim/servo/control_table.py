@@ -1,12 +1,8 @@
 """The memory of a servo: its bytes, its registers, its EEPROM and its access rules."""
 
-from collections.abc import Iterator
-
-from rig.devices.dynamixel.registers import ControlTable, Register, control_table
+from rig.devices.dynamixel.registers import Register, control_table
 from sim.servo.models import ServoModel
 from sim.servo.protocol2 import StatusError
-
-MOST_INDIRECT = 128  # e-manual, Indirect Address of the P series
 
 _READ_ONLY = frozenset(
     {
@@ -29,8 +25,8 @@ class InstructionRejected(Exception):
 class Memory:
     """Control table of a servo; values by register name, signed if the register is.
 
-    A byte of Indirect Data is the byte at its Indirect Address. Addresses below `ram_start` are EEPROM: kept without
-    power, locked while torque is on. From `live_start` (Realtime Tick) on, registers follow the world. `one_revolution`
+    Addresses below `ram_start` are EEPROM: kept without power, locked while torque is on. Indirect addressing is not
+    simulated. From `live_start` (Realtime Tick) on, registers follow the world. `one_revolution`
     are the positions within one revolution.
     """
 
@@ -45,25 +41,15 @@ class Memory:
             "Min Position Limit": self.one_revolution,
             "Max Position Limit": self.one_revolution,
         }
-        self._registers = {register.name: register for register in _plain(table)}
-        self._indirect: dict[int, Register] = {}
-        for first, data, count in _indirect_blocks(table):
-            for i in range(count):
-                pointer = Register(f"Indirect Address at {first + 2 * i}", first + 2 * i, 2, signed=False)
-                self._registers[pointer.name] = pointer
-                self._indirect[data + i] = pointer
-                name = f"Indirect Data at {data + i}"
-                self._registers[name] = Register(name, data + i, 1, signed=False)
+        self._registers = {r.name: r for r in table.values() if not r.name.startswith("Indirect")}
         self._at = {register.address: register for register in self._registers.values()}
-        self._size = max(register.address + register.size for register in self._registers.values())
+        self._size = max(register.address + register.size for register in table.values())
         self._image = bytearray(self._size)
         last = self._registers["Present Temperature"]
         self._live_end = last.address + last.size
         identity = {"Firmware Version": firmware, "Model Number": row.number}
         limits = {"Min Position Limit": self.one_revolution[0], "Max Position Limit": self.one_revolution[-1]}
         self._defaults = {**limits, **model.initial, **identity}
-        for address, pointer in self._indirect.items():
-            self._defaults[pointer.name] = address
         self._restore(0, self._size)
 
     def __contains__(self, name: str) -> bool:
@@ -95,64 +81,44 @@ class Memory:
         """Set the RAM area to its initial values, as at power-up."""
         self._restore(self.ram_start, self._size)
 
-    def forget_all(self, keep: tuple[str, ...] = ()) -> None:
-        """Set all registers except those named in ``keep`` to their initial values."""
-        kept = {name: self[name] for name in keep}
-        self._restore(0, self._size)
-        for name, value in kept.items():
-            self[name] = value
-
     def read(self, address: int, size: int) -> bytes:
         """Return ``size`` bytes from ``address``; addresses between the registers read as 0, as on the device.
 
-        Raises `Rejection`: DATA_LENGTH for no bytes, ACCESS if the range exceeds the table.
+        Raises `InstructionRejected`: DATA_LENGTH for no bytes, ACCESS if the range exceeds the table.
         """
         if size == 0:
             raise InstructionRejected(StatusError.DATA_LENGTH)
         if address + size > self._size:
             raise InstructionRejected(StatusError.ACCESS)
-        data = bytes(self._image[address : address + size])
-        if address + size > self.ram_start and not self._indirect.keys().isdisjoint(range(address, address + size)):
-            return bytes(self._image[self._resolve(a)] for a in range(address, address + size))
-        return data
+        return bytes(self._image[address : address + size])
 
     def entries(self, address: int, data: bytes) -> list[tuple[Register, int]]:
         """Return the registers that a write of ``data`` to ``address`` sets, with values checked against their ranges.
 
-        Raises `Rejection`: ACCESS for a read-only register or an address without a register, DATA_LENGTH for a part of
-        a register, DATA_RANGE for a value outside its range.
+        Raises `InstructionRejected`: ACCESS for a read-only register or an address without a register, DATA_LENGTH for
+        a part of a register, DATA_RANGE for a value outside its range.
         """
         if not data:
             raise InstructionRejected(StatusError.DATA_LENGTH)
-        targets = [self._resolve(address + i) for i in range(len(data))]
         entries = []
         i = 0
         while i < len(data):
-            register = self._at.get(targets[i])
+            register = self._at.get(address + i)
             if register is None:
                 raise InstructionRejected(
-                    StatusError.DATA_LENGTH if self._within_register(targets[i]) else StatusError.ACCESS
+                    StatusError.DATA_LENGTH if self._within_register(address + i) else StatusError.ACCESS
                 )
             if register.name in _READ_ONLY:
                 raise InstructionRejected(StatusError.ACCESS)
-            if targets[i : i + register.size] != list(range(register.address, register.address + register.size)):
+            if i + register.size > len(data):
                 raise InstructionRejected(StatusError.DATA_LENGTH)
             value = register.decode(data[i : i + register.size])
-            if not self._takes(register, value):
+            allowed = self._ranges.get(register.name)
+            if allowed is not None and value not in allowed:
                 raise InstructionRejected(StatusError.DATA_RANGE)
             entries.append((register, value))
             i += register.size
         return entries
-
-    def _takes(self, register: Register, value: int) -> bool:
-        if register.name.startswith("Indirect Address"):
-            return self.ram_start <= value < self._size
-        allowed = self._ranges.get(register.name)
-        return allowed is None or value in allowed
-
-    def _resolve(self, address: int) -> int:
-        pointer = self._indirect.get(address)
-        return address if pointer is None else self[pointer.name]
 
     def _within_register(self, address: int) -> bool:
         return any(a in self._at and a + self._at[a].size > address for a in range(address - 3, address))
@@ -161,24 +127,3 @@ class Memory:
         for register in self._registers.values():
             if start <= register.address < end:
                 self[register.name] = self._defaults.get(register.name, 0)
-
-
-def _plain(table: ControlTable) -> Iterator[Register]:
-    """Yield the registers that are not part of an indirect block."""
-    return (register for register in table.values() if not register.name.startswith("Indirect"))
-
-
-def _indirect_blocks(table: ControlTable) -> Iterator[tuple[int, int, int]]:
-    """Yield (first Indirect Address, first Indirect Data, count) of each block.
-
-    The addresses of a block end where its data begins. The table's entries "Write" and "Read" are a convention of the
-    SDK's users for parts of blocks; only a "Read" beyond the first block's data is another block.
-    """
-    if "Indirect Address 1" not in table:
-        return
-    first, data = table["Indirect Address 1"].address, table["Indirect Data 1"].address
-    count = min((data - first) // 2, MOST_INDIRECT)
-    yield first, data, count
-    second, second_data = table["Indirect Address Read"].address, table["Indirect Data Read"].address
-    if second >= data + count:
-        yield second, second_data, (second_data - second) // 2

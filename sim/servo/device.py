@@ -1,26 +1,33 @@
-"""A simulated X-series (or MX 2.0) servo: its answers on the bus, and methods for tests."""
+"""A simulated X-series (or MX 2.0, or P series) servo: its answers on the bus, and methods for tests.
+
+It knows the instructions that the rig sends: Ping, Read, Write and Reboot. It rejects all others.
+"""
 
 from collections.abc import Callable
 
 from rig.devices.dynamixel.registers import Register
-from sim.servo.base import OVERLOAD_ERROR, SimulatedServoBase
+from sim.clock import Timer
 from sim.servo.control_table import InstructionRejected, Memory
 from sim.servo.controller import Controller
 from sim.servo.models import BAUD_RATES, POSITION_MODE, servo_model
-from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, StatusError, StatusPacket
-from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
+from sim.servo.motor import Motor
+from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, StatusError, StatusPacket, word
 from sim.servo.shaft import Shaft
 
+BOOT_S = 0.2  # silence after power-up or Reboot; the e-manual states no value
+SUPERVISION_S = 0.1  # period of the checks of load and temperature while the servo works
+RETURN_DELAY_UNIT_NS = 2_000
 WATCHDOG_UNIT_NS = 20_000_000  # 20 ms; the e-manual's page of the XM430 prints µs
 WATCHDOG_TRIPPED = 0xFF
 
+VOLTAGE_ERROR, OVERHEATING_ERROR, ENCODER_ERROR, ELECTRICAL_ERROR, OVERLOAD_ERROR = 0x01, 0x04, 0x08, 0x10, 0x20
+"""Bits of Hardware Error Status and Shutdown."""
+
 _TIME_BASED, _TORQUE_BY_GOAL = 0x04, 0x08  # bits of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
-# e-manual, Protocol 2.0, Clear: 0x01, and four bytes that no other packet has by chance
-_CLEAR_MULTI_TURN = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 
 
-class XSeriesServo(SimulatedServoBase):
+class XSeriesServo:
     """A servo whose horn is the table's shaft.
 
     If one register of a block rejects its value, nothing of the block is written. The answer to a new id, baud rate or
@@ -33,17 +40,17 @@ class XSeriesServo(SimulatedServoBase):
     model
         A name for `sim.servo.models.servo_model`.
     bus_id, baudrate
-        Initial settings; Factory Reset restores 1 and 57,600.
+        Initial settings.
     firmware
         Firmware Version; default: that of the model.
     center_counts
         The encoder's reading at the shaft's angle 0; default: the middle of its revolution.
 
+    ``distortions`` are called with the memory after its live registers are updated and before they are read, to falsify
+    the readings.
+
     Raises `ValueError`: there is no such model, id or baud rate.
     """
-
-    protocol = 2
-    memory: Memory
 
     def __init__(
         self,
@@ -58,7 +65,12 @@ class XSeriesServo(SimulatedServoBase):
         row = servo_model(model)
         if baudrate not in BAUD_RATES:
             raise ValueError(f"no servo has the baud rate {baudrate}: choose one of {', '.join(map(str, BAUD_RATES))}")
-        super().__init__(world, row)
+        self.model = row
+        self.motor = Motor(world, row)
+        self.distortions: list[Callable[[Memory], None]] = []
+        self._clock = world.clock
+        self._powered = True
+        self._timers: dict[Callable[[], None], Timer] = {}
         if bus_id not in self.model.ranges["ID"]:
             raise ValueError(f"no servo has the id {bus_id}: choose one of 0 to 252")
         self.memory = Memory(self.model, self.model.firmware if firmware is None else firmware)
@@ -83,64 +95,51 @@ class XSeriesServo(SimulatedServoBase):
     # -- on the bus -----------------------------------------------------------------------------------------------
 
     @property
+    def bus_id(self) -> int:
+        return self.memory["ID"]
+
+    @property
     def baudrate(self) -> int:
         return BAUD_RATES[self.memory["Baud Rate"]]
 
+    @property
+    def return_delay_ns(self) -> int:
+        return self.memory["Return Delay Time"] * RETURN_DELAY_UNIT_NS
+
+    @property
+    def powered(self) -> bool:
+        """Whether the servo has power and has booted."""
+        return self._powered
+
     def execute(self, packet: InstructionPacket) -> StatusPacket | None:
         """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
-        if not self._powered:
-            return None
         mine, everyones = packet.bus_id == self.bus_id, packet.bus_id == BROADCAST_ID
-        in_group = packet.bus_id == self.memory["Secondary ID"] and not mine
-        if not (mine or everyones or in_group):
+        if not self._powered or not (mine or everyones):
             return None
         level = self.memory["Status Return Level"]
         if not packet.intact:
             return self._status(StatusError.CRC) if mine and level == 2 else None
         self._heard_ns = self._clock.now_ns()
+        ping, read = packet.instruction == Instruction.PING, packet.instruction == Instruction.READ
+        answers = ping or (mine and level >= 2 - read)
         try:
-            if packet.instruction in CHAINED_READS:
-                request = chained_reads(packet).get(self.bus_id) if everyones else None
-                answers = request is not None and level > 0
-                data = self._read(*request) if request else b""
-            else:
-                ping, read = packet.instruction == Instruction.PING, packet.instruction == Instruction.READ
-                answers = (mine and level >= 2 - read) or (ping and not in_group)
-                data = self._perform(packet, everyones, in_group)
+            data = b"" if read and everyones else self._perform(packet)
         except InstructionRejected as rejection:
             return self._status(rejection.error) if answers else None
         return self._status(StatusError.NONE, data) if answers else None
 
-    def _perform(self, packet: InstructionPacket, everyones: bool, in_group: bool) -> bytes:
+    def _perform(self, packet: InstructionPacket) -> bytes:
         """Execute an instruction; return the data of a read."""
         parameters = packet.parameters
         match packet.instruction:
             case Instruction.PING:
                 return self.memory.read(0, 2) + self.memory.read(6, 1)
             case Instruction.READ if len(parameters) == 4:
-                return b"" if everyones else self._read(word(parameters), word(parameters, 2))
+                return self._read(word(parameters), word(parameters, 2))
             case Instruction.WRITE if len(parameters) >= 2:
-                self._write(word(parameters), parameters[2:], in_group)
-            case Instruction.REG_WRITE if len(parameters) >= 2:
-                self._permit(self.memory.entries(word(parameters), parameters[2:]), in_group)
-                self._registered = word(parameters), parameters[2:]
-                self.memory["Registered Instruction"] = 1
-            case Instruction.ACTION if self._registered is not None:
-                registered, self._registered = self._registered, None
-                self.memory["Registered Instruction"] = 0
-                self._write(*registered, in_group)
-            case Instruction.SYNC_WRITE | Instruction.BULK_WRITE if everyones:
-                if entry := group_writes(packet).get(self.bus_id):
-                    self._write(*entry, in_group)
+                self._write(word(parameters), parameters[2:])
             case Instruction.REBOOT:
                 self.power_cycle()
-            case Instruction.FACTORY_RESET if parameters in (b"\xff", b"\x01", b"\x02"):
-                self._factory_reset(parameters[0], everyones)
-            # A moving servo rejects this, as the e-manual says.
-            case Instruction.CLEAR if parameters == _CLEAR_MULTI_TURN:
-                if self.motor.state().speed_dps:
-                    raise InstructionRejected(StatusError.RESULT_FAIL)
-                self._controller.wrap_position()
             case _:
                 raise InstructionRejected(StatusError.INSTRUCTION)
         return b""
@@ -155,17 +154,17 @@ class XSeriesServo(SimulatedServoBase):
                 distort(self.memory)
         return self.memory.read(address, size)
 
-    def _write(self, address: int, data: bytes, in_group: bool) -> None:
+    def _write(self, address: int, data: bytes) -> None:
         entries = self.memory.entries(address, data)
-        self._permit(entries, in_group)
+        self._permit(entries)
         for register, value in entries:
             self.memory[register.name] = value
             if hook := self._on_write.get(register.name):
                 hook()
 
-    def _permit(self, entries: list[tuple[Register, int]], in_group: bool) -> None:
+    def _permit(self, entries: list[tuple[Register, int]]) -> None:
         """Reject values that are invalid in the servo's state."""
-        locked = in_group or self.memory["Torque Enable"]
+        locked = self.memory["Torque Enable"]
         tripped = self.memory["Bus Watchdog"] == WATCHDOG_TRIPPED
         for register, value in entries:
             if register.address < self.memory.ram_start and locked:
@@ -196,6 +195,48 @@ class XSeriesServo(SimulatedServoBase):
 
     # -- for tests and faults -------------------------------------------------------------------------------------
 
+    def rotate_by_hand(self, angle_deg: float) -> float:
+        """Rotate the shaft by hand by ``angle_deg``; see `Motor.push`."""
+        return self.motor.push(angle_deg)
+
+    def jam(self) -> None:
+        """Block the shaft."""
+        self.motor.jam()
+        self._supervise()
+
+    def free(self) -> None:
+        """Unblock the shaft."""
+        self.motor.free()
+        self._supervise()
+
+    def set_voltage(self, supply_v: float) -> None:
+        """Set the supply voltage; the servo checks it at once."""
+        self.motor.supply_v = supply_v
+        self._check_shutdown()
+
+    def set_temperature(self, temperature_c: float) -> None:
+        """Set the temperature of the case, from which the thermal model continues."""
+        self.motor.set_temperature(temperature_c)
+        self._check_shutdown()
+
+    def power_off(self) -> None:
+        """Cut the supply."""
+        self._powered = False
+        self.memory["Torque Enable"] = 0
+        self.motor.release()
+        for timer in self._timers.values():
+            timer.cancel()
+
+    def power_on(self) -> None:
+        """Restore the supply; the servo answers after `BOOT_S`."""
+        if not self._powered:
+            self.power_cycle()
+
+    def power_cycle(self) -> None:
+        """Cut the supply and restore it, like Reboot."""
+        self.power_off()
+        self._schedule(self._start, self._clock.now_ns() + round(BOOT_S * 1e9))
+
     def fail(self, error: int) -> None:
         """Set bits of Hardware Error Status, such as `ENCODER_ERROR`."""
         self.memory["Hardware Error Status"] |= error
@@ -209,12 +250,12 @@ class XSeriesServo(SimulatedServoBase):
             self._trip()
 
     def slip_encoder(self, angle_deg: float) -> None:
+        """Let the encoder slip on the shaft by ``angle_deg``; the shaft follows what the encoder now reads."""
         self._controller.slip_encoder(angle_deg)
         self._supervise()
 
     def _start(self) -> None:
         self._powered = True
-        self._registered = None
         self.memory.forget_ram()
         self._controller.start()
         if self.memory.starts_with_torque:
@@ -222,11 +263,29 @@ class XSeriesServo(SimulatedServoBase):
             self._on_torque_enable()
         self._check_shutdown()
 
-    def _factory_reset(self, option: int, everyones: bool) -> None:
-        if everyones and option == 0xFF:
-            return  # since firmware 42: otherwise all servos on the bus would get the same id
-        self.memory.forget_all(keep={0xFF: (), 0x01: ("ID",), 0x02: ("ID", "Baud Rate")}[option])
-        self.power_cycle()
+    def _schedule(self, action: Callable[[], None], time_ns: int | None) -> None:
+        """Call ``action`` at ``time_ns`` instead of at the time scheduled before; None: do not call it."""
+        if timer := self._timers.pop(action, None):
+            timer.cancel()
+        if time_ns is not None:
+            self._timers[action] = self._clock.call_at(time_ns, action)
+
+    def _supervise(self) -> None:
+        """Check load, temperature and supply now, and repeatedly while the load varies."""
+        self.motor.settle()
+        self._check_shutdown()
+        varies = self._powered and self.motor.busy
+        self._schedule(self._supervise, self._clock.now_ns() + round(SUPERVISION_S * 1e9) if varies else None)
+
+    def _supply_and_heat(self) -> int:
+        """Return the error bits of the present supply and temperature."""
+        motor, memory = self.motor, self.memory
+        bits = 0
+        if not memory["Min Voltage Limit"] <= motor.supply_v * 10 <= memory["Max Voltage Limit"]:
+            bits |= VOLTAGE_ERROR
+        if motor.temperature_c(motor.state().load) > memory["Temperature Limit"]:
+            bits |= OVERHEATING_ERROR
+        return bits
 
     def _shut_down(self) -> bool:
         """Return whether a hardware error keeps torque off until a reboot."""

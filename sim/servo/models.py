@@ -9,10 +9,8 @@ from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from rig.config.servos import DynamixelModel, known_model
-from rig.core.plugins import plugins
-
-GROUP = "rig.simulated_servos"
+from rig.config.servos import DynamixelModel
+from rig.devices.dynamixel.registers import model_row
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate."""
@@ -233,15 +231,11 @@ MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model
 
 
 def servo_model(name: str) -> ServoModel:
-    """Return the simulated model of that name, which a package may add by an entry point of the group `GROUP`.
-
-    Raises `ValueError`: there is none.
-    """
-    model = MODELS.get(name) or dict(plugins(GROUP)).get(name)
-    if model is not None:
-        return model
-    row = known_model(name)
-    if row is None or row.protocol == 1 or row.missing():
+    """Return the simulated model of that name. Raises `ValueError`: there is none."""
+    if name in MODELS:
+        return MODELS[name]
+    row = model_row(name)
+    if row is None or row.missing():
         raise ValueError(f"no simulated servo {name!r}: choose one of {', '.join(MODELS)}")
     return replace(MODELS[_relative(row)], name=name)
 

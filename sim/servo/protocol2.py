@@ -5,7 +5,6 @@ Source: e-manual "DYNAMIXEL Protocol 2.0" (packet format, byte stuffing) and "CR
 
 from dataclasses import dataclass
 from enum import IntEnum
-from itertools import pairwise
 
 BROADCAST_ID = 0xFE
 MAX_ID = 0xFC
@@ -23,17 +22,7 @@ class Instruction(IntEnum):
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
-    REG_WRITE = 0x04
-    ACTION = 0x05
-    FACTORY_RESET = 0x06
     REBOOT = 0x08
-    CLEAR = 0x10
-    SYNC_READ = 0x82
-    SYNC_WRITE = 0x83
-    FAST_SYNC_READ = 0x8A
-    BULK_READ = 0x92
-    BULK_WRITE = 0x93
-    FAST_BULK_READ = 0x9A
 
 
 class StatusError(IntEnum):
@@ -81,6 +70,11 @@ def crc16(data: bytes) -> int:
     for byte in data:
         crc = (crc << 8) & 0xFFFF ^ _CRC_TABLE[crc >> 8 ^ byte]
     return crc
+
+
+def word(data: bytes, start: int = 0) -> int:
+    """Return the two bytes at ``start``, low byte first."""
+    return data[start] | data[start + 1] << 8
 
 
 def with_crc(frame: bytes) -> bytes:
@@ -133,21 +127,3 @@ def status_packet(bus_id: int, status: StatusPacket) -> bytes:
     body = bytes((_STATUS, status.error)) + status.data
     body = body.replace(_HEADER, _STUFFED)
     return with_crc(_HEADER + bytes((0, bus_id)) + (len(body) + 2).to_bytes(2, "little") + body)
-
-
-def fast_status_parts(sizes: list[int], answers: list[tuple[int, StatusPacket]]) -> list[bytes]:
-    """Return the part of each device in the status packet of a Fast Sync Read or Fast Bulk Read.
-
-    The packet's length includes all requested devices (``sizes``: requested bytes of each), also silent ones. The CRC
-    of each part covers everything before it, so the last one is that of the packet. Nothing is byte-stuffed (e-manual,
-    Fast Sync Read). There are no parts if the length does not fit into its two bytes.
-    """
-    length = 1 + sum(size + 4 for size in sizes)
-    if length > 0xFFFF:
-        return []
-    frame = _HEADER + bytes((0, BROADCAST_ID)) + length.to_bytes(2, "little") + bytes((_STATUS,))
-    ends = [0]
-    for size, (bus_id, status) in zip(sizes, answers, strict=False):
-        frame = with_crc(frame + bytes((status.error, bus_id)) + status.data.ljust(size, b"\0"))
-        ends.append(len(frame))
-    return [frame[start:end] for start, end in pairwise(ends)]

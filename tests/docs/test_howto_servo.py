@@ -13,7 +13,7 @@ from rig.devices.dynamixel.servo import open_servo
 from rig.events.events import Enrolled, Moved
 from rig.safety.saved_state import MemoryStore
 from rig.safety.supervisor import TableState
-from sim.bench import ShelfOperator, open_sim_bench
+from sim.bench import ShelfOperator
 from sim.devices import SimDevices
 from sim.motion import to_position, to_velocity
 from sim.objects.shelf import shelf
@@ -21,42 +21,25 @@ from sim.world import World
 from tests.docs.pages import blocks, install
 from tests.rig.doctor.doctor_parts import unopened
 
-ROW, SIMULATED, DRIVER, OPEN = blocks("add-a-servo")
+ROW, DRIVER, OPEN = blocks("add-a-servo")
 ROWS_TOML, DRIVER_TOML = blocks("add-a-servo", "toml")
-PAN = [
-    "servo.model=ax_18a",
-    "servo.baud=1000000",
-    "table.mode=pan",
-    "table.zero_deg=150",
-    "table.limits_deg=[-150,150]",
-]
 
 
-@pytest.fixture
-def rows(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(install(tmp_path / "rows", {"my_servos": ROW + SIMULATED}, ROWS_TOML))
-
-
-def test_simulated_model_of_a_package_moves_the_simulated_table(rows):
-    config = load_config(None, ["servo.model=xm430_w210"])
-    with open_sim_bench(config, ShelfOperator(World(seed=1), shelf())) as bench:
-        assert bench.servo.identity.model == "xm430_w210"
-
-
-def test_row_of_a_package_opens_and_finds_a_dynamixel(rows):
-    config = load_config(None, PAN)
+def test_row_of_a_package_opens_and_finds_a_dynamixel(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(install(tmp_path / "rows", {"my_servos": ROW}, ROWS_TOML))
+    config = load_config(None, ["servo.model=xm430_w999"])
     with SimDevices.connected(config, World(seed=1)) as devices:
         servo = open_servo(devices.adapter, config.servo, devices.world.clock, config.table.mode)
-        assert (servo.identity.model, servo.identity.model_number) == ("ax_18a", 18)
-        assert servo.read_state().position_deg == pytest.approx(150.0, abs=2.0)
-    with unopened(*PAN) as bench:
+        assert (servo.identity.model, servo.identity.model_number) == ("xm430_w999", 1999)
+        assert servo.read_state().position_deg == pytest.approx(180.0, abs=2.0)
+    with unopened("servo.model=xm430_w999") as bench:
         bench.findings("servo")
-        assert bench.context.identities["servo"]["model"] == "ax_18a"
+        assert bench.context.identities["servo"]["model"] == "xm430_w999"
 
 
 def test_models_of_no_package_are_a_configuration_error():
     with pytest.raises(ConfigError):
-        load_config(None, ["servo.model=ax_18a"])
+        load_config(None, ["servo.model=xm430_w999"])
 
 
 class Controller:

@@ -151,7 +151,7 @@ def test_every_download_has_a_hash(file):
 def test_names_of_the_code_in_the_pages_exist():
     """Each `hbr.…`, `rig.…`, `sim.…` or `calibration.…` in backticks is a module, or is defined in one."""
     groups = set(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"])
-    others = {"rig.toml", "rig.py", "rig.local", "rig.imus", "rig.servos", "rig.simulated_servos"} | groups
+    others = {"rig.toml", "rig.py", "rig.local", "rig.imus", "rig.servos"} | groups
     pattern = r"`((?:hbr|rig|sim|calibration)(?:\.[A-Za-z_]\w*)+)"
     found = {
         (path.name, name)

@@ -303,7 +303,7 @@ def test_fault_at_the_start_stops_the_bench_from_opening():
         open_sim_bench(load_config(), ShelfOperator(World(), shelf()), faults=[Fault.parse("wrong_model")])
 
 
-SERVOS = ("xl430_w250", "xm430_w350", "xl330_m288", "mx_28", "ax_12a")
+SERVOS = ("xl430_w250", "xm430_w350", "xl330_m288", "mx_28")
 IMUS = (("mpu6050", 0x68), ("mpu6500", 0x68), ("bno055", 0x28))
 
 

@@ -204,5 +204,4 @@ def _identity(servo: "SingleServo") -> dict[str, Any]:
         "firmware": found.firmware,
         "id": found.bus_id,
         "baud": found.baud,
-        "protocol": found.protocol,
     }

@@ -12,9 +12,21 @@ import serial
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
 from rig.core.clock import seconds_between
-from rig.core.errors import DeviceSilent, RequestRejected, UsageError
+from rig.core.errors import DeviceSilent, RequestRejected
 from rig.core.next_steps import Do, SomeSteps
-from rig.devices.dynamixel.packets import PING, READ, REBOOT, WRITE, Packets, Packets1, Packets2, Reply, reason
+from rig.devices.dynamixel.packets import (
+    CORRUPTED,
+    HEADER,
+    PING,
+    READ,
+    REBOOT,
+    REJECTIONS,
+    WRITE,
+    Packets,
+    Reply,
+    read_parameters,
+    reason,
+)
 from rig.devices.dynamixel.port import BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import ControlTable, Register
 
@@ -29,6 +41,8 @@ CONFIRM_ATTEMPTS = 16  # more: a bus that repeats everything holds the control l
 """Largest number of repetitions of a reading until only its reply arrives."""
 
 _BITS = 10  # a byte with its start and stop bit
+_STATUS_BYTES = 11  # of a status packet without parameters
+_READ_LENGTHS = 4  # lengths of reads in a row: a repeated answer to an earlier one has another length
 Answers = tuple[dict[int, Reply], int]
 """Replies by id, and the SDK's result for missing ones."""
 
@@ -56,21 +70,18 @@ class DynamixelBus:
     the bus distinguishes replies by their length. Successive reads ask for different numbers of bytes, by some more
     bytes below the address, and while a reply is missing, no other read asks for its number of bytes. The replies to
     all writes are equal. So while a reply is missing, and for `DOUBT_S` after a reply that belongs to no request, each
-    write is read back, and each reading is confirmed. In Protocol 1.0 no reading contains its age, so all readings are
-    confirmed.
+    write is read back, and each reading is confirmed.
 
     After ``retries`` repetitions of a transaction the device counts as silent. All instructions used here are absolute
-    (a read, or a write of a value), so a repetition is harmless. ``protocol`` is 2 (X series, and MX series with
-    firmware for it), or 1 (AX-12A).
+    (a read, or a write of a value), so a repetition is harmless.
     """
 
-    def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
+    def __init__(self, port: ClockedPort, retries: int = 3) -> None:
         self.port = port
         self.statistics = BusStatistics()
-        self.protocol = protocol
         self.sampled_ns = 0
         """When the device began to send the last block that was read; it had sampled its registers just before."""
-        self.packets: Packets = Packets1() if protocol == 1 else Packets2()
+        self.packets = Packets()
         self._retries = retries
         self._accepted: Callable[[Reply], object] = getattr(port.ser, "accepted", lambda _: None)
         """Called with each reply: for a trace."""
@@ -88,7 +99,7 @@ class DynamixelBus:
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
-        if self.packets.echo_sizes or self._is_outstanding(3):  # an echoed ping is a valid reply to itself
+        if self._is_outstanding(3):
             return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
         answer = self._transact("ping", (device_id,), lambda: self.ask(device_id, PING, b"", 3))[device_id]
         return int.from_bytes(answer.data[:2], "little")
@@ -103,7 +114,7 @@ class DynamixelBus:
         already or arrives before the reply to the second reading; then both are discarded.
         """
         data, self.sampled_ns = self._read_once(device_id, address, size)
-        if dated or not (self.packets.undated or self._repeats_replies()):
+        if dated or not self._repeats_replies():
             return data
         counts = self.statistics
         for _ in range(CONFIRM_ATTEMPTS):
@@ -118,8 +129,8 @@ class DynamixelBus:
     def _drop_foreign(self) -> bool:
         """Drop what arrived after the last reply; return whether a reply or the beginning of one is among it."""
         waiting = self.port.getBytesAvailable()
-        data, start = self.port.ser.read(waiting) if waiting else b"", self.packets.start
-        found = any(data[i:].startswith(start) or start.startswith(data[i:]) for i in range(len(data)))
+        data = self.port.ser.read(waiting) if waiting else b""
+        found = any(data[i:].startswith(HEADER) or HEADER.startswith(data[i:]) for i in range(len(data)))
         if found:
             self._foreign_ns = self.port.clock.now_ns()
         return found
@@ -136,7 +147,7 @@ class DynamixelBus:
             nonlocal skipped
             start, asked = self._unambiguous(address, size)
             skipped = address - start
-            return self.ask(device_id, READ, self.packets.read_parameters(start, asked), asked)
+            return self.ask(device_id, READ, read_parameters(start, asked), asked)
 
         reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
         # The reply ended just now, and took its length at the baud rate.
@@ -157,13 +168,13 @@ class DynamixelBus:
 
         def attempt() -> Answers:
             doubtful = self._is_outstanding(0) or self._repeats_replies()  # an earlier reply may look like this one
-            parameters = self.packets.write_parameters(register.address, data)
+            parameters = register.address.to_bytes(2, "little") + data
             answers = self.ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
             reply = answers[0].get(device_id)
             if reply is None or reply.error or not doubtful:
                 return answers
             start, asked = self._unambiguous(register.address, register.size)
-            replies, result = self.ask(device_id, READ, self.packets.read_parameters(start, asked), asked)
+            replies, result = self.ask(device_id, READ, read_parameters(start, asked), asked)
             skipped = register.address - start
             if result == COMM_SUCCESS and replies[device_id].data[skipped : skipped + register.size] == data:
                 return answers
@@ -172,14 +183,7 @@ class DynamixelBus:
         self._transact(f"write of {register.name} = {value}", (device_id,), attempt)
 
     def reboot(self, device_id: int) -> None:
-        """Restart a device, which is then silent for some tenths of a second.
-
-        Raises `UsageError`: Protocol 1.0 does not have this instruction.
-        """
-        if not self.packets.reboots:
-            raise UsageError(
-                "A servo with Protocol 1.0 cannot be restarted over its bus.", next_step="Switch its supply off and on."
-            )
+        """Restart a device, which is then silent for some tenths of a second."""
         self._transact("reboot", (device_id,), lambda: self.ask(device_id, REBOOT, b"", 0))
 
     def close(self) -> None:
@@ -213,7 +217,7 @@ class DynamixelBus:
                     rejected = next((reply for reply in replies.values() if reply.error), None)
                     if rejected is None:
                         return replies
-                    if rejected.error != self.packets.corrupted:
+                    if rejected.error != CORRUPTED:
                         self.statistics.rejected += 1
                         raise self._rejected(what, rejected)
                     result, replies = COMM_RX_CORRUPT, {}  # the instruction was damaged on its way: send it again
@@ -247,7 +251,7 @@ class DynamixelBus:
         result = self.packets.send(self.port, target, instruction, parameters)
         if result != COMM_SUCCESS:
             return {}, result
-        self.port.setPacketTimeout(self.packets.reply_size(size) * len(answering))
+        self.port.setPacketTimeout((_STATUS_BYTES + size) * len(answering))
         # Collect the replies, and leave out what belongs to no request of ours.
         replies: dict[int, Reply] = {}
         doubtful: dict[int, Reply] = {}
@@ -260,8 +264,6 @@ class DynamixelBus:
                 self.statistics.foreign += 1
             elif reply.error and not reply.data and ambiguous:
                 doubtful[reply.bus_id] = reply
-            elif self.packets.echo_sizes and reply.data == parameters and len(parameters) not in (0, size):
-                pass  # the adapter's echo of the instruction
             elif len(reply.data) != size and not (reply.error and not reply.data):
                 self.statistics.late += 1
                 self._foreign_ns = self.port.clock.now_ns()
@@ -282,9 +284,9 @@ class DynamixelBus:
 
     def _unambiguous(self, address: int, size: int) -> tuple[int, int]:
         """Return start and size of a read that includes ``size`` bytes at ``address`` and has an unambiguous reply."""
-        asked = size + min(self._reads % self.packets.read_lengths, address)
+        asked = size + min(self._reads % _READ_LENGTHS, address)
         self._reads += 1
-        while self._is_outstanding(asked) or asked in self.packets.echo_sizes:
+        while self._is_outstanding(asked):
             asked += 1
         return max(address - (asked - size), 0), asked
 
@@ -303,7 +305,7 @@ class DynamixelBus:
         )
 
     def _rejected(self, what: str, reply: Reply) -> RequestRejected:
-        reason = self.packets.rejections.get(reply.error, f"error {reply.error}")
+        reason = REJECTIONS.get(reply.error, f"error {reply.error}")
         return RequestRejected(
             f"Servo {reply.bus_id} rejected the {what}: {reason}.",
             next_step=(Do.STATUS(), "A tripped watchdog or a hardware error prevents motion."),

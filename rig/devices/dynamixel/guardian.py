@@ -16,7 +16,7 @@ from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import RigError
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import GUARDIAN, GUARDIAN_S, ClockedPort, open_serial
-from rig.devices.dynamixel.registers import control_table, protocol_of
+from rig.devices.dynamixel.registers import control_table
 
 _RETRY_S: Final = 0.05  # longer: the torque stays on longer; shorter: the waiting takes a whole core
 _ON, _OFF = b"1", b"0"
@@ -73,7 +73,7 @@ def watch(port: str, baud: int, model: str, bus_id: int) -> bool:
         with suppress(RigError):
             connection = open_serial(port, baud)
             try:
-                bus = DynamixelBus(ClockedPort(connection, clock, port), protocol=protocol_of(model))
+                bus = DynamixelBus(ClockedPort(connection, clock, port))
                 torque = control_table(model)["Torque Enable"]
                 bus.write(bus_id, torque, 0)
                 if not bus.read(bus_id, torque):

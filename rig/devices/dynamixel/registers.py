@@ -10,10 +10,8 @@ from struct import Struct
 from typing import Any, Self
 
 from rig.config.servos import (
-    FACTORY_PROTOCOL_1,
     GROUP,
     USE_ANOTHER,
-    USE_PROTOCOL_2,
     DynamixelModel,
     known_model,
     lacks,
@@ -106,7 +104,7 @@ def servo_plugin(model: str) -> Any:
 
 def model_of(number: int) -> str | None:
     """Return the model with this Model Number; None if it is unknown."""
-    if (known := model_numbers().get(number) or FACTORY_PROTOCOL_1.get(number)) is not None:
+    if (known := model_numbers().get(number)) is not None:
         return known
     rows = (row for _, row in plugins(GROUP) if isinstance(row, DynamixelModel))
     return next((row.name for row in rows if row.number == number), None)
@@ -114,8 +112,6 @@ def model_of(number: int) -> str | None:
 
 def obstacle(number: int) -> tuple[str, str] | None:
     """Return why the rig cannot drive the servo with this Model Number, and the way out; None if it can."""
-    if number in FACTORY_PROTOCOL_1:
-        return "it has the firmware for Protocol 1.0", USE_PROTOCOL_2
     if (model := model_of(number)) is None:
         return f"{number} is the number of no known model", USE_ANOTHER
     row = model_row(model)
@@ -132,12 +128,6 @@ def require_driven(number: int, bus_id: int) -> None:
             next_step=f"{found[1]}.",
             evidence={"got": model, "model_number": number, "reason": found[0]},
         )
-
-
-def protocol_of(model: str) -> int:
-    """Return the protocol version of ``model``: 1 or 2."""
-    row = model_row(model)
-    return row.protocol if row else 2
 
 
 def model_row(model: str) -> DynamixelModel | None:
@@ -162,8 +152,7 @@ def control_table(model: str, firmware: int | None = None) -> ControlTable:
         )
     if firmware is not None and firmware >= 52 and model_file_exists(f"{model}_fw52"):
         row = known_model(model, f"{model}_fw52") or row
-    signed = _SIGNED if row.protocol == 2 else frozenset()
-    registers = [Register(name, address, size, name in signed) for address, size, name in row.registers]
+    registers = [Register(name, address, size, name in _SIGNED) for address, size, name in row.registers]
     since = next((version for prefix, version in _STARTUP_FIRMWARE.items() if model.startswith(prefix)), None)
     if firmware is not None and since is not None and firmware >= since:
         address, size, label = _STARTUP

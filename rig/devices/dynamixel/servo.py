@@ -1,19 +1,18 @@
 """A Dynamixel servo of any model whose row in `rig.config.servos` is complete.
 
-One class drives all of them: resolution, units and registers are those of the row. The names of some registers differ
-between the two protocols (`RegisterNames`).
+One class drives all of them: resolution, units and registers are those of the row.
 
 Decision: docs/decisions/0007.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Final
 
 from rig.config import ServoConfig
 from rig.config.servos import DynamixelModel
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
+from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
 from rig.core.next_steps import Do
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
@@ -24,7 +23,6 @@ from rig.devices.dynamixel.registers import (
     ControlTable,
     control_table,
     model_of,
-    protocol_of,
     require_driven,
     servo_plugin,
 )
@@ -54,61 +52,9 @@ _HARDWARE_ERRORS = {
     4: "electrical shock",
     5: "overload",
 }
-_AX_ARRIVED_COUNTS = 2  # largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise
-
-
-def _by_direction_bit(value: int) -> int:
-    """Return a speed or a load of Protocol 1.0, whose bit 10 means clockwise: the position falls."""
-    magnitude = value & 0x3FF
-    return -magnitude if value & 0x400 else magnitude
-
-
-@dataclass(frozen=True, slots=True)
-class RegisterNames:
-    """The registers whose names differ between the protocols.
-
-    ``state`` and ``condition`` are the first and the last register of the blocks that `DynamixelServo.read_state` and
-    `DynamixelServo.read_condition` read. ``reach`` are the limits within one revolution. ``volatile`` is a register
-    that is 0 after power-up, and that the rig never sets to 0.
-    """
-
-    state: tuple[str, str]
-    condition: tuple[str, str]
-    reach: tuple[str, str]
-    velocity: str
-    voltage: str
-    profile_velocity: str
-    volatile: str
-    signed: Callable[[int], int] = int
-    remarks: tuple[str, ...] = ()
-
-
-NAMES: Final = {
-    2: RegisterNames(
-        state=("Realtime Tick", "Present Temperature"),
-        condition=("Torque Enable", "Profile Acceleration"),
-        reach=("Min Position Limit", "Max Position Limit"),
-        velocity="Present Velocity",
-        voltage="Present Input Voltage",
-        profile_velocity="Profile Velocity",
-        volatile="Profile Acceleration",
-    ),
-    1: RegisterNames(
-        state=("Torque Enable", "Moving"),
-        condition=("Torque Enable", "Moving"),
-        reach=("CW Angle Limit", "CCW Angle Limit"),
-        velocity="Present Speed",
-        voltage="Present Voltage",
-        profile_velocity="Moving Speed",
-        volatile="Moving Speed",
-        signed=_by_direction_bit,
-        remarks=(
-            "an AX-12A has no watchdog: if the computer fails, it completes its present move",
-            "an AX-12A reaches only 300°: some azimuths of an object are not visible",
-        ),
-    ),
-}
-"""The names, by protocol."""
+_STATE: Final = "Realtime Tick", "Present Temperature"
+_CONDITION: Final = "Torque Enable", "Profile Acceleration"
+"""First and last register of the blocks that `DynamixelServo.read_state` and `DynamixelServo.read_condition` read."""
 
 
 class DynamixelServo:
@@ -126,8 +72,8 @@ class DynamixelServo:
     guardian
         Switches the torque off if this program is killed; None if the servo is simulated in this program.
 
-    Raises `ConfigError`: the mode is turntable, but the servo does not count revolutions. `DeviceNotFound`: no servo
-    answers at ``bus_id``. `DeviceMismatch`: another model answers. The rig may be unable to drive it.
+    Raises `DeviceNotFound`: no servo answers at ``bus_id``. `DeviceMismatch`: another model answers. The rig may be
+    unable to drive it.
     """
 
     def __init__(
@@ -142,14 +88,7 @@ class DynamixelServo:
         guardian: Guardian | None = None,
     ) -> None:
         self.bus = bus
-        self._names = NAMES[bus.protocol]
         row = self._row = control_table(model).row
-        if mode == "turntable" and not row.extended_counts:
-            raise ConfigError(
-                "An AX-12A cannot be a turntable: it measures only 300° and does not count revolutions.",
-                next_step='In [table] set mode = "pan", zero_deg = 150 and limits_deg = [-150, 150] (its 300°), '
-                "or use a servo of the X series.",
-            )
         self._clock = clock
         self._id = bus_id
         self._mode = mode
@@ -158,7 +97,6 @@ class DynamixelServo:
         self.revolution_deg = 360.0 / gear_ratio
         self._dps_per_unit = row.dps_per_unit / gear_ratio
         self._dps2_per_unit = row.dps2_per_unit / gear_ratio
-        self.remarks = self._names.remarks
         self._kept: dict[str, int] = {}  # the permanent settings
         self._blocks: dict[tuple[str, str], Block] = {}
         self._tick: tuple[int, int] | None = None  # time and Realtime Tick of the last fresh reading
@@ -172,8 +110,8 @@ class DynamixelServo:
                 f"No servo answers at id {bus_id}.",
                 next_step=(
                     "Check the servo's power and cable, and servo.id, servo.baud and servo.model in the configuration. "
-                    "An AX-12A uses another protocol than the other models, and so does an MX-28, MX-64 or MX-106 "
-                    "with the firmware of the factory.",
+                    "The rig does not speak the protocol of an AX-12A, nor that of an MX-28, MX-64 or MX-106 with the "
+                    "firmware of the factory.",
                     Do.FIND(),
                 ),
                 evidence=silent.evidence,
@@ -211,7 +149,9 @@ class DynamixelServo:
         if self._mode == "turntable":
             high_deg = self._row.extended_counts * self.resolution_deg
             return -high_deg, high_deg
-        low, high = (self._kept_settings()[name] * self.resolution_deg for name in self._names.reach)
+        low, high = (
+            self._kept_settings()[name] * self.resolution_deg for name in ("Min Position Limit", "Max Position Limit")
+        )
         return low, high
 
     @property
@@ -255,45 +195,36 @@ class DynamixelServo:
     # -- readings -----------------------------------------------------------------------------------------------------
 
     def read_state(self) -> ServoState:
-        names, row = self._names, self._row
-        time_ns, values = self._read_fresh() if "Realtime Tick" in self._table else self._read_block(*names.state)
-        position, trajectory = values["Present Position"], values.get("Position Trajectory")
-        moving = bool(values["Moving"])
-        # A model without Moving Status, trajectory or current has other registers for the same.
-        if (status := values.get("Moving Status")) is not None:
-            in_position = bool(status & 1)
-        else:
-            away = abs(position - values["Goal Position"])
-            in_position = bool(values["Torque Enable"]) and not moving and away <= _AX_ARRIVED_COUNTS
+        time_ns, values = self._read_fresh()
         if self._current_limit is not None:
             load_percent = 100.0 * values["Present Current"] / self._current_limit
         else:
-            load_percent = row.load_percent_per_unit * names.signed(values["Present Load"])
+            load_percent = self._row.load_percent_per_unit * values["Present Load"]
         return ServoState(
             time_ns=time_ns,
             sampled_ns=self.bus.sampled_ns,
-            position_deg=position * self.resolution_deg,
-            velocity_dps=names.signed(values[names.velocity]) * self._dps_per_unit,
+            position_deg=values["Present Position"] * self.resolution_deg,
+            velocity_dps=values["Present Velocity"] * self._dps_per_unit,
             load_percent=load_percent,
-            voltage_v=values[names.voltage] * row.v_per_unit,
-            temperature_c=values["Present Temperature"] * row.c_per_unit,
-            moving=moving,
-            in_position=in_position,
+            voltage_v=values["Present Input Voltage"] * self._row.v_per_unit,
+            temperature_c=values["Present Temperature"] * self._row.c_per_unit,
+            moving=bool(values["Moving"]),
+            in_position=bool(values["Moving Status"] & 1),
             hardware_errors=self._hardware_errors() if self.bus.alert(self._id) else (),
-            trajectory_deg=None if trajectory is None else trajectory * self.resolution_deg,
+            trajectory_deg=values["Position Trajectory"] * self.resolution_deg,
         )
 
     def read_condition(self) -> ServoCondition:
-        _, values = self._read_block(*self._names.condition)
-        watchdog = values.get("Bus Watchdog", 0)
+        _, values = self._read_block(*_CONDITION)
+        watchdog = values["Bus Watchdog"]
         tripped = watchdog == WATCHDOG_TRIPPED
         return ServoCondition(
             torque=bool(values["Torque Enable"]),
             watchdog_armed=0 < watchdog < WATCHDOG_TRIPPED,
             watchdog_tripped=tripped,
             # The rig's profile is never 0. The register is 0 after power-up, and after the watchdog has tripped.
-            power_lost=not tripped and values[self._names.volatile] == 0,
-            hardware_errors=hardware_errors(values.get("Hardware Error Status", self.bus.alert(self._id))),
+            power_lost=not tripped and values["Profile Acceleration"] == 0,
+            hardware_errors=hardware_errors(values["Hardware Error Status"]),
         )
 
     def verify(self) -> None:
@@ -329,12 +260,10 @@ class DynamixelServo:
         limits, most = self._kept_settings(), self._row.most_units
         velocity = min(round(profile.velocity_dps / self._dps_per_unit), limits.get("Velocity Limit", most))
         velocity = max(velocity, 1)  # 0: no limit
-        acceleration = 1
-        if "Profile Acceleration" in self._table:
-            acceleration = round(profile.acceleration_dps2 / self._dps2_per_unit)
-            acceleration = max(min(acceleration, limits.get("Acceleration Limit", most)), 1)
-            self._write("Profile Acceleration", acceleration)
-        self._write(self._names.profile_velocity, velocity)
+        acceleration = round(profile.acceleration_dps2 / self._dps2_per_unit)
+        acceleration = max(min(acceleration, limits.get("Acceleration Limit", most)), 1)
+        self._write("Profile Acceleration", acceleration)
+        self._write("Profile Velocity", velocity)
         return MotionProfile(velocity * self._dps_per_unit, acceleration * self._dps2_per_unit)
 
     def torque_on(self) -> None:
@@ -347,11 +276,10 @@ class DynamixelServo:
                 next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
                 evidence={"hardware_errors": list(errors)},
             )
-        if "Bus Watchdog" in self._table:
-            # After a killed program the torque may be on: the old goal must not continue when the watchdog is cleared.
-            self._write("Torque Enable", 0)
-            self._write("Bus Watchdog", 0)
-        self._write("Goal Position", self._read("Present Position"))  # on an AX-12A this also switches the torque on
+        # After a killed program the torque may be on: the old goal must not continue when the watchdog is cleared.
+        self._write("Torque Enable", 0)
+        self._write("Bus Watchdog", 0)
+        self._write("Goal Position", self._read("Present Position"))
         self._write("Torque Enable", 1)
 
     def torque_off(self) -> None:
@@ -371,12 +299,10 @@ class DynamixelServo:
         self._write("Goal Position", round(position_deg / self.resolution_deg))
 
     def arm_watchdog(self, timeout_s: float) -> None:
-        if "Bus Watchdog" in self._table:  # without one, the servo completes its move: see `remarks`
-            self._write("Bus Watchdog", watchdog_units(timeout_s))
+        self._write("Bus Watchdog", watchdog_units(timeout_s))
 
     def disarm_watchdog(self) -> None:
-        if "Bus Watchdog" in self._table:
-            self._write("Bus Watchdog", 0)
+        self._write("Bus Watchdog", 0)
 
     def close(self) -> None:
         self.bus.close()
@@ -392,11 +318,7 @@ class DynamixelServo:
         self.bus.write(self._id, self._table[name], value)
 
     def _hardware_errors(self) -> tuple[str, ...]:
-        """Return the hardware errors of now; each reply of Protocol 1.0 has them, so any reading brings them."""
-        if "Hardware Error Status" in self._table:
-            return hardware_errors(self._read("Hardware Error Status"))
-        self._read("Torque Enable")
-        return hardware_errors(self.bus.alert(self._id))
+        return hardware_errors(self._read("Hardware Error Status"))
 
     def _read_block(self, first: str, last: str, *, dated: bool = False) -> tuple[int, dict[str, int]]:
         """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name.
@@ -414,7 +336,7 @@ class DynamixelServo:
     def _read_fresh(self) -> tuple[int, dict[str, int]]:
         """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""
         for _ in range(_FRESH_ATTEMPTS):
-            time_ns, values = self._read_block(*self._names.state, dated=True)
+            time_ns, values = self._read_block(*_STATE, dated=True)
             if self._is_fresh((time_ns, values["Realtime Tick"])):
                 return time_ns, values
         raise DeviceFault(
@@ -464,15 +386,15 @@ def open_servo(
     ``reopen`` opens the connection again after its adapter was unplugged. ``guardian`` switches the torque off if this
     program is killed.
 
-    Raises `ConfigError`: the model does not exist, or does not support the mode. `DeviceNotFound`, `DeviceMismatch`,
-    `DeviceSilent`: no servo answers, another model answers, or the servo stops answering.
+    Raises `ConfigError`: the model does not exist. `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: no servo
+    answers, another model answers, or the servo stops answering.
     """
     driver = servo_plugin(config.model)
     if driver is not None and not isinstance(driver, DynamixelModel):
         opened: Servo = driver(connection, config, clock, mode=mode, reopen=reopen)
         return opened
     return DynamixelServo(
-        DynamixelBus(ClockedPort(connection, clock, config.port, reopen), config.retries, protocol_of(config.model)),
+        DynamixelBus(ClockedPort(connection, clock, config.port, reopen), config.retries),
         bus_id=config.id,
         model=config.model,
         clock=clock,

@@ -34,7 +34,6 @@ _DRIVE_MODE_BITS = 0b1101
 """Drive Mode bits that must be 0: reverse direction, time-based profile, and torque on by goal update."""
 # e-manual, Shutdown: the factory settings, with the bits of Hardware Error Status
 _SHUTDOWN = 0b110100, "overload, short circuit and overheating switch the torque off"
-_AX_SHUTDOWN = 0b100100, "overload and overheating switch the torque off"
 _NEAR = 16  # largest gap over which it is faster to read on: in the P series the RAM begins 448 bytes later
 
 
@@ -43,21 +42,15 @@ def wanted(found: Mapping[str, int], mode: Mode) -> dict[str, tuple[int, str]]:
 
     ``found`` has the registers of the model only.
     """
-    # An AX-12A has no Operating Mode: two limits of 0 make it rotate endlessly.
-    shutdown, why = _SHUTDOWN if "Operating Mode" in found else _AX_SHUTDOWN
-    wheel_mode = found.get("CW Angle Limit") == found.get("CCW Angle Limit") == 0
+    shutdown, why = _SHUTDOWN
     needs = {
         "Drive Mode": (
-            found.get("Drive Mode", 0) & ~_DRIVE_MODE_BITS,
+            found["Drive Mode"] & ~_DRIVE_MODE_BITS,
             "the rig sets the direction (table.direction); velocity-based profile; a goal must not switch torque on",
         ),
         "Operating Mode": _OPERATING_MODES[mode],
         "Homing Offset": (0, "the software has the zero (table.zero_deg); an offset here can move the servo"),
         "Return Delay Time": (0, "no delay of replies; the factory setting of 250 costs 0.5 ms per reading"),
-        "CCW Angle Limit": (
-            1023 if wheel_mode else found.get("CCW Angle Limit", 0),
-            "joint mode: two limits of 0 mean wheel mode",
-        ),
         "Secondary ID": (255, "off: else the servo obeys instructions to a second id"),
         "Startup Configuration": (0, "no torque and no old goal at power-up"),
         "Shutdown": (found["Shutdown"] | shutdown, why),

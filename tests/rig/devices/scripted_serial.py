@@ -42,7 +42,7 @@ class ScriptedSerial:
     def close(self) -> None: ...
 
 
-def scripted_bus(*answers: bytes, retries: int = 0, protocol: int = 2) -> tuple[DynamixelBus, ScriptedSerial]:
+def scripted_bus(*answers: bytes, retries: int = 0) -> tuple[DynamixelBus, ScriptedSerial]:
     clock = VirtualClock()
     wire = ScriptedSerial(clock, answers)
-    return DynamixelBus(ClockedPort(wire, clock, "scripted"), retries, protocol), wire
+    return DynamixelBus(ClockedPort(wire, clock, "scripted"), retries), wire

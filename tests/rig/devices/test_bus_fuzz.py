@@ -21,7 +21,6 @@ from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
-from sim.servo.protocol1 import checksum, status_packet1
 from sim.servo.protocol2 import StatusPacket, crc16, status_packet
 from sim.world import World
 from tests.fuzzing import fuzz_settings
@@ -32,15 +31,14 @@ pytestmark = pytest.mark.timeout(1200)  # the nightly profile's 20,000 cases a p
 ANSWER_S = 2.0
 """Longest time that a read with two retries may take, with any received bytes."""
 
-TABLES = {2: control_table("xl430_w250"), 1: control_table("ax_12a")}
-PACKETS: dict[int, Callable[[int, StatusPacket], bytes]] = {2: status_packet, 1: status_packet1}
+TABLE = control_table("xl430_w250")
 
 
 # -- what a line makes of an answer ------------------------------------------------------------------------------------
 
 
 @st.composite
-def spoiled(draw: st.DrawFn, packet: bytes, protocol: int) -> bytes:
+def spoiled(draw: st.DrawFn, packet: bytes) -> bytes:
     """Return ``packet`` as it may arrive: whole, damaged, among noise, echoed, doubled, or replaced by another one."""
     data = bytearray(packet)
     for _ in range(draw(st.integers(0, 4))):
@@ -61,24 +59,18 @@ def spoiled(draw: st.DrawFn, packet: bytes, protocol: int) -> bytes:
                 )
             case 5:
                 other = StatusPacket(draw(st.integers(0, 255)), draw(st.binary(max_size=6)))
-                if protocol == 1:
-                    other = StatusPacket(other.error & 0x7F, other.data)
-                data = bytearray(PACKETS[protocol](draw(st.integers(0, 252)), other)) + data
+                data = bytearray(status_packet(draw(st.integers(0, 252)), other)) + data
             case 6:
                 data += bytes(data)
     return bytes(data)
 
 
-def intact(stream: bytes, protocol: int) -> list[bytes]:
+def intact(stream: bytes) -> list[bytes]:
     """Return the parameters of every intact status packet of id 1 in ``stream``, wherever it begins."""
     found = []
     for start in range(len(stream) - 5):
         rest = stream[start:]
-        if protocol == 1 and rest[:3] == b"\xff\xff\x01":
-            end = 4 + rest[3]
-            if rest[3] >= 2 and len(rest) >= end and checksum(rest[2 : end - 1]) == rest[end - 1]:
-                found.append(rest[5 : end - 1])
-        elif protocol == 2 and rest[:5] == b"\xff\xff\xfd\x00\x01" and len(rest) > 8 and rest[7] == 0x55:
+        if rest[:5] == b"\xff\xff\xfd\x00\x01" and len(rest) > 8 and rest[7] == 0x55:
             end = 7 + int.from_bytes(rest[5:7], "little")
             if (
                 end >= 11
@@ -89,20 +81,18 @@ def intact(stream: bytes, protocol: int) -> list[bytes]:
     return found
 
 
-@pytest.mark.parametrize("protocol", [2, 1])
 @fuzz_settings()
 @given(data=st.data(), value=st.integers(0, 0xFFFF_FFFF))
-def test_read_block_was_sent_by_the_device(protocol: int, data: st.DataObject, value: int) -> None:
+def test_read_block_was_sent_by_the_device(data: st.DataObject, value: int) -> None:
     """Four bytes, three attempts: the value of an intact packet with four parameters, a rejection, or silence.
 
-    The value is that of the reading which the driver dates by `sampled_ns`. One that follows only confirms it, and may
-    differ: of the damaged packets, one in 256 passes the checksum of Protocol 1.0.
+    The value is that of the reading which the driver dates by `sampled_ns`. One that follows only confirms it.
     """
     block = value.to_bytes(4, "little")
     # The driver asks for one byte more each time an answer is owed, from one address lower.
     sent = [b"\x55" * extra + block for extra in range(3)]
-    answers = [data.draw(spoiled(PACKETS[protocol](1, StatusPacket(0, parameters)), protocol)) for parameters in sent]
-    bus, wire = scripted_bus(*answers, retries=2, protocol=protocol)
+    answers = [data.draw(spoiled(status_packet(1, StatusPacket(0, parameters)))) for parameters in sent]
+    bus, wire = scripted_bus(*answers, retries=2)
     clock = bus.port.clock
     try:
         got = bus.read_block(1, 28, 4)
@@ -110,19 +100,18 @@ def test_read_block_was_sent_by_the_device(protocol: int, data: st.DataObject, v
         pass
     else:
         attempt = sum(sent_ns <= bus.sampled_ns for sent_ns in wire.written_ns) - 1
-        assert got in [parameters[attempt:] for parameters in intact(answers[attempt], protocol)]
+        assert got in [parameters[attempt:] for parameters in intact(answers[attempt])]
     assert clock.now_ns() < ANSWER_S * 1e9
     assert not bus.port.is_using
     assert bus.statistics.transactions == len(wire.written)
 
 
-@pytest.mark.parametrize("protocol", [2, 1])
 @fuzz_settings(0.4)
 @given(noise=st.lists(st.binary(max_size=60), min_size=6, max_size=6))
-def test_noise_is_never_a_value_or_an_acknowledgement(protocol: int, noise: list[bytes]) -> None:
-    bus, _ = scripted_bus(*noise, retries=2, protocol=protocol)
-    register = TABLES[protocol]["Goal Position"]
-    if not any(intact(part, protocol) for part in noise):
+def test_noise_is_never_a_value_or_an_acknowledgement(noise: list[bytes]) -> None:
+    bus, _ = scripted_bus(*noise, retries=2)
+    register = TABLE["Goal Position"]
+    if not any(intact(part) for part in noise):
         with pytest.raises(DeviceSilent):
             bus.read(1, register)
         with pytest.raises(DeviceSilent):

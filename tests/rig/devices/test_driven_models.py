@@ -9,16 +9,14 @@ from importlib.resources import files
 import pytest
 
 from rig.config import load_config
-from rig.config.servos import FACTORY_PROTOCOL_1, USE_ANOTHER, DynamixelModel, known_model
+from rig.config.servos import USE_ANOTHER, DynamixelModel, known_model
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.devices.dynamixel.registers import control_table, model_numbers
-from rig.devices.dynamixel.servo import DynamixelServo, open_servo
+from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.servo import MotionProfile
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.finding import FindingCode
-from sim.devices import SimDevices
 from sim.noise import NoiseModel
-from sim.world import World
 from tests.rig.bench_parts import open_bus, servo_wires
 from tests.rig.doctor.doctor_parts import unopened
 
@@ -83,7 +81,7 @@ def test_every_file_of_the_sdk_belongs_to_a_model():
     assert len(NUMBERS) == 60
     assert len(REJECTED) == 14
     listed = {name.partition("_fw52")[0] for name in FILES} - {"dynamixel"}
-    assert listed == set(model_numbers().values()) - {"ax_12a"}  # which has no file
+    assert listed == set(model_numbers().values())
     assert {name: number for number, name in model_numbers().items() if name in NUMBERS} == NUMBERS
 
 
@@ -149,27 +147,6 @@ def test_limits_of_the_servo_are_respected_and_read_in_its_units(file):
     assert again.reach_deg == pytest.approx((100 * servo.resolution_deg, 1000 * servo.resolution_deg))
 
 
-def test_ax12_pans_by_its_own_counts_and_units():
-    chosen = load_config(None, ["servo.model=ax_12a", "servo.baud=1000000", "table.mode=pan"])
-    world = World(noise=NoiseModel.none())
-    with SimDevices.connected(chosen, world) as devices:
-        frames: list[bytes] = []
-        devices.servo_bus.taps.append(lambda frame: frames.append(frame.data))
-        servo = open_servo(devices.adapter, chosen.servo, world.clock, "pan")
-        servo.prepare(write=True)
-        start_deg = servo.read_state().position_deg
-        servo.set_profile(MotionProfile(60.0, 300.0))
-        servo.torque_on()
-        servo.move_to(start_deg + 90.0)
-        # e-manual, AX-12A: Goal Position at 30 with 1023 counts for 300°, Moving Speed at 32 with 0.111 rev/min
-        words = {data[5]: int.from_bytes(data[6:8], "little") for data in frames if data[4:5] == b"\x03"}
-        assert words[30] == 512 + round(90 * 1023 / 300)
-        assert words[32] == round(60 / (0.111 * 6))
-        world.clock.sleep(4.0)
-        assert servo.read_state().position_deg - start_deg == pytest.approx(90.0, abs=300 / 1023)
-        assert world.shaft()[0] == pytest.approx(90.0, abs=300 / 1023)
-
-
 @pytest.mark.parametrize("model", sorted(REJECTED))
 def test_model_without_a_complete_row_is_rejected_by_its_name(model):
     missing = known_model(model).missing()
@@ -187,12 +164,13 @@ def test_model_without_a_complete_row_is_rejected_by_its_name(model):
 
 
 def test_row_of_a_package_without_units_is_rejected_by_its_name(monkeypatch):
-    row = DynamixelModel("bare", 4711, 2, known_model("xl430_w250").registers)
+    row = DynamixelModel("bare", 4711, known_model("xl430_w250").registers)
     monkeypatch.setattr("rig.devices.dynamixel.registers.plugins", lambda _: [("bare", row)])
     with pytest.raises(ConfigError, match="cannot drive a bare") as caught:
         control_table("bare")
     units = [f"the unit of {name}" for name in ("Goal Position", "speed", "acceleration")]
-    assert caught.value.evidence["missing"] == ["Acceleration Limit", *units]
+    more = ["the range of Goal Position in extended position mode", "Acceleration Limit"]
+    assert caught.value.evidence["missing"] == [*more, *units]
 
 
 @pytest.mark.parametrize("number", [NUMBERS[model] for model in sorted(REJECTED)])
@@ -222,22 +200,3 @@ def test_scan_and_doctor_report_a_servo_that_the_rig_cannot_drive(number, name):
         bench.context.config = load_config(None, ["servo.id=9"])
         other = bench.problem("servo")
         assert (other.code, other.fix) == (FindingCode.OTHER_SERVOS, found.fix)
-
-
-@pytest.mark.parametrize("number", FACTORY_PROTOCOL_1)
-def test_mx_servo_with_the_firmware_of_the_factory_is_reported_with_the_way_to_change_it(number, monkeypatch):
-    """The servo answers in Protocol 1.0 only, and the configuration names the model with the other firmware."""
-    monkeypatch.setattr("rig.doctor.servo.BAUD_RATES", (1_000_000,))
-    for room in ("servo", "device_scan"):
-        monkeypatch.setattr(f"rig.doctor.{room}.BAUD_RATES_1", (1_000_000,))
-    model = FACTORY_PROTOCOL_1[number]
-    with unopened("servo.model=ax_12a", "servo.baud=1000000") as bench:
-        bench.devices.servo.memory["Model Number"] = number
-        bench.context.config = load_config(None, [f"servo.model={model}", "servo.baud=1000000"])
-        problem = bench.problem("servo")
-        assert problem.code == FindingCode.OTHER_SERVOS
-        assert "(2.0) with DYNAMIXEL Wizard 2.0" in problem.fix
-        scanned = [one for one in DeviceScan().find_servos(bench.context) if not isinstance(one, str)]
-        (found,) = (one for one in scanned if one.code == FindingCode.SERVO_NOT_DRIVEN)
-        assert str(found.parameters["found"]).startswith(model.replace("_", "-").upper())
-        assert found.fix == problem.fix

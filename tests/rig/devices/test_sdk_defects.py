@@ -23,7 +23,7 @@ import rig.devices
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound, DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.packets import WRITE, Packets2
+from rig.devices.dynamixel.packets import WRITE, Packets
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import Register, control_table
 from sim.servo import Sender, SentBytes
@@ -141,7 +141,7 @@ def test_alert_bit_does_not_invalidate_data() -> None:
 @example(data=b"\xff\xff\xff\xff\xfd\xfd")  # without its stuffed headers, the rest would look like a header
 def test_header_in_data_is_stuffed(data: bytes) -> None:
     bus, wire = scripted_bus()
-    Packets2().send(bus.port, 1, WRITE, b"\x54\0" + data)
+    Packets().send(bus.port, 1, WRITE, b"\x54\0" + data)
     (packet,) = PacketParser().feed(wire.written[0])
     assert packet.intact
     assert packet.parameters == b"\x54\0" + data

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.config import load_config
-from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent, RequestRejected, UsageError
+from rig.core.errors import DeviceMismatch, DeviceSilent, RequestRejected
 from rig.devices.dynamixel import settings as permanent
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.dynamixel.settings import SettingDifference
@@ -13,9 +13,7 @@ from rig.devices.servo import MotionProfile
 from rig.motion.turntable import Turntable
 from sim.devices import SimDevices
 from sim.noise import NoiseModel
-from sim.servo.ax12 import DEG_PER_COUNT
 from sim.servo.models import MODELS
-from sim.servo.motor import OVERLOAD_S
 from sim.world import World
 from tests.fuzzing import examples
 
@@ -80,91 +78,6 @@ def test_load_is_a_percentage_for_each_model(model: str) -> None:
     servo.move_to(servo.read_state().position_deg - 90.0)
     devices.world.clock.sleep(1.0)
     assert -101 <= servo.read_state().load_percent < -60
-
-
-# -- AX-12A ------------------------------------------------------------------------------------------------------------
-
-AX_12A = ("servo.model=ax_12a", "servo.baud=1000000")
-AX = (*AX_12A, "table.mode=pan", "table.zero_deg=150", "table.limits_deg=[-150, 150]")
-
-
-def test_ax12_is_rejected_as_a_turntable() -> None:
-    with pytest.raises(ConfigError, match="300°") as caught:
-        servo_of(parts_of(*AX_12A), *AX_12A)
-    assert 'In [table] set mode = "pan"' in caught.value.next_step
-
-
-@examples(6)
-@given(goal_deg=st.floats(0.0, 300.0))
-def test_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
-    devices = parts_of(*AX)
-    servo = servo_of(devices, *AX)
-    start_deg = servo.read_state().position_deg
-    assert servo.reach_deg == pytest.approx((0.0, 300.0))
-    rotated = go(devices, servo, goal_deg)
-    state = servo.read_state()
-    assert rotated == pytest.approx(goal_deg - start_deg, abs=DEG_PER_COUNT)
-    assert state.position_deg == pytest.approx(goal_deg, abs=DEG_PER_COUNT)
-    assert state.in_position
-    assert not state.moving
-    assert state.trajectory_deg is None  # it does not report it
-
-
-def test_missing_features_of_the_ax12_are_reported() -> None:
-    servo = servo_of(parts_of(*AX), *AX)
-    assert any("watchdog" in remark for remark in servo.remarks)
-    with pytest.raises(UsageError, match="restarted") as caught:
-        servo.reboot()
-    assert "supply" in caught.value.next_step
-
-
-def test_ax12_holds_its_position_when_torque_is_switched_on() -> None:
-    devices = parts_of(*AX)
-    servo = servo_of(devices, *AX)
-    devices.servo.rotate_by_hand(40.0)
-    devices.world.clock.sleep(2.0)
-    servo.torque_on()
-    devices.world.clock.sleep(1.0)
-    assert devices.world.shaft()[0] == pytest.approx(40.0, abs=DEG_PER_COUNT)
-    assert servo.read_condition().torque
-    servo.torque_off()
-    assert not servo.read_condition().torque
-
-
-def test_ax12_overload_is_read_from_its_error_byte() -> None:
-    devices = parts_of(*AX)
-    servo = servo_of(devices, *AX)
-    servo.torque_on()
-    devices.servo.jam()
-    servo.move_to(290.0)
-    devices.world.clock.sleep(OVERLOAD_S + 1.0)
-    assert servo.read_state().hardware_errors == ("overload",)
-    with pytest.raises(DeviceFault, match="overload"):
-        servo.torque_on()
-
-
-def test_echo_is_not_a_protocol_1_reply() -> None:
-    """An echoed instruction that reads two bytes is a valid status packet: address and length for a value."""
-    devices = parts_of(*AX)
-    devices.servo_bus.echo = True
-    servo = servo_of(devices, *AX)
-    assert servo.identity.model == "ax_12a"
-    assert servo.read_state().position_deg == pytest.approx(150.0, abs=0.3)
-    assert servo._read("Max Torque") == 1023
-    servo.torque_on()
-    assert devices.servo.memory["Torque Enable"] == 1
-
-
-def test_ax12_bench_rotates_within_its_reach(simulated) -> None:
-    with Turntable(simulated(*AX).bench) as table:
-        for angle in (60.0, -145.0, 0.0):
-            assert table.goto(angle).encoder_deg == pytest.approx(angle, abs=0.6)
-
-
-def test_limits_beyond_the_reach_are_rejected_before_anything_moves(simulated) -> None:
-    with pytest.raises(ConfigError, match="reaches 0° to 300°") as caught:
-        simulated(*AX[:-1], "table.limits_deg=[-170, 170]")
-    assert "[-150, 150]" in caught.value.next_step
 
 
 # -- gear and pan ------------------------------------------------------------------------------------------------------

@@ -28,10 +28,8 @@ from tests.rig.doctor.doctor_parts import unopened
 PING, READ = 0x01, 0x02
 
 
-def heard(bench, *bauds: int, protocol: int = 2) -> list[BaudScan]:
-    return list(
-        scan_servos(bench.devices.adapter, bench.context.computer.clock, bauds or BAUD_RATES, protocol=protocol)
-    )
+def heard(bench, *bauds: int) -> list[BaudScan]:
+    return list(scan_servos(bench.devices.adapter, bench.context.computer.clock, bauds or BAUD_RATES))
 
 
 places = st.tuples(
@@ -137,15 +135,6 @@ def test_unsupported_rates_are_left_out():
     with unopened() as bench:
         rates = [said.baud for said in scan_servos(Slow(bench.devices.adapter), bench.context.computer.clock)]
         assert rates == [57_600, 1_000_000, 115_200, 9_600]
-
-
-def test_ax_12a_is_found_by_protocol_1():
-    with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(9, 1_000_000)) as bench:
-        assert not any(said.answered for said in heard(bench, 1_000_000))
-        (said,) = heard(bench, 1_000_000, protocol=1)
-        (servo,) = said.servos
-        assert (servo.bus_id, servo.model, servo.protocol) == (9, "ax_12a", 1)
-        assert not said.duplicate_ids
 
 
 def test_unknown_model_is_named_by_its_number(bench):

@@ -111,12 +111,6 @@ def test_other_model_can_be_configured():
         assert bench.problem("servo").steps == (Do.SET_KEY(key="servo.model", value="xl430_w250"),)
 
 
-def test_ax_12a_reports_its_missing_functions():
-    with unopened("servo.model=ax_12a", "table.mode=pan", "servo.baud=1000000") as bench:
-        bench.devices.servo.memory["Return Delay Time"] = 0
-        assert set(bench.problems("servo")) == {FindingCode.SERVO_LIMITATION}
-
-
 # -- all simulated faults ---------------------------------------------------------------------------------------------
 
 FOUND = {

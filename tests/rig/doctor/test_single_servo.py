@@ -47,8 +47,7 @@ def test_second_servo_at_any_rate_prevents_changes(place, bench):
     assert WRITE not in bench.instructions
 
 
-def test_missing_servo_unknown_model_and_busy_bench_are_errors(monkeypatch):
-    monkeypatch.setattr("rig.doctor.single_servo.BAUD_RATES_1", (1_000_000,))
+def test_missing_servo_unknown_model_and_busy_bench_are_errors():
     with unopened() as bench:
         for number in (4711, 4000):  # no model, and one that the rig cannot drive
             bench.devices.servo.memory["Model Number"] = number
@@ -98,18 +97,6 @@ def test_servo_that_answers_only_reads_can_be_changed(bench):
     with single_servo(bench.context) as servo:
         servo.set_id(5)
     assert bench.devices.servo.memory["ID"] == 5
-
-
-def test_ax_12a_is_changed_by_protocol_1(monkeypatch):
-    monkeypatch.setattr("rig.doctor.single_servo.BAUD_RATES_1", (1_000_000, 115_200))  # each asks 253 ids
-    with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(1, 1_000_000)) as bench:
-        with single_servo(bench.context) as servo:
-            assert servo.found.model == "ax_12a"
-            servo.set_id(4)
-            servo.set_baud(115_200)
-        with single_servo(bench.context) as servo:
-            assert (servo.found.bus_id, servo.found.baud) == (4, 115_200)
-            assert servo.bus.read_table(servo.found.bus_id, servo.table)["Baud Rate"] == 16  # 2 MBd by 17
 
 
 def test_every_driven_model_has_baud_rates():

@@ -14,6 +14,7 @@ from rig.catalog.describing import described
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, transfer
+from rig.core.errors import ConfigError
 from rig.events.events import Accepted, Enrolled, Identified
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
@@ -28,13 +29,7 @@ from rig.search.strategies import strategy as strategy_named
 from rig.views.empty_table import empty_table_status
 from sim.objects.solid import empty_platter
 
-AX = (
-    "servo.model=ax_12a",
-    "servo.baud=1000000",
-    "table.mode=pan",
-    "table.zero_deg=150",
-    "table.limits_deg=[-150, 150]",
-)
+PAN = ("table.mode=pan", "table.limits_deg=[-150, 150]")
 ARM = ("table.carries=camera",)
 
 
@@ -127,18 +122,24 @@ def test_search_by_an_orbiting_camera_goes_where_an_image_was_taken(
     assert {view.segmentation["method"] for view in views} == {BoxMethod.EMPTY_TABLE}
 
 
-def test_ax12_enrolls_and_identifies_within_its_reach(simulated, tmp_path: Path) -> None:
+def test_pan_servo_enrolls_and_identifies_within_its_reach(simulated, tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=simulated().bench.clock, create=True) as catalog:
-        assert len(enrolled(simulated, catalog, "toy-car", *AX, views=12)) == 11  # the 300° that it reaches
-        s = simulated(*AX)
+        assert len(enrolled(simulated, catalog, "toy-car", *PAN, views=12)) == 11  # the 300° that it reaches
+        s = simulated(*PAN)
         s.operator.next_object, s.operator.yaw_deg = "toy-car", 30.0
         *_, found = identify(s.bench, model_of(derived.views(catalog)))
     assert isinstance(found, Identified)
     assert found.name == "toy-car"
 
 
+def test_limits_beyond_the_reach_are_rejected_before_anything_moves(simulated) -> None:
+    with pytest.raises(ConfigError, match="reaches 0° to 360°") as caught:
+        simulated("table.mode=pan", "table.limits_deg=[-190, 190]")
+    assert "[-180, 180]" in caught.value.next_step
+
+
 def test_pan_servo_goes_to_its_nearest_limit(simulated) -> None:
-    with Turntable(simulated(*AX).bench) as table:
+    with Turntable(simulated(*PAN).bench) as table:
         assert table.within_reach(200.0) == -150.0
         assert table.within_reach(-170.0) == -150.0
         assert table.within_reach(160.0) == 150.0

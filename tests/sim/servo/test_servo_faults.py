@@ -7,7 +7,7 @@ from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.servo.base import (
+from sim.servo.device import (
     BOOT_S,
     ELECTRICAL_ERROR,
     ENCODER_ERROR,

@@ -1,19 +1,13 @@
 """Every instruction, sent by the unmodified SDK."""
 
-from itertools import pairwise
-
 import pytest
 from dynamixel_sdk import (
     COMM_RX_TIMEOUT,
     COMM_SUCCESS,
-    GroupBulkRead,
-    GroupBulkWrite,
-    GroupSyncRead,
-    GroupSyncWrite,
 )
 
 from sim.servo import Sender
-from sim.servo.base import BOOT_S
+from sim.servo.device import BOOT_S
 from sim.servo.models import MODELS
 from sim.servo.protocol2 import StatusError, with_crc
 from tests.sim.servo.servo_bench import Line, extended
@@ -107,9 +101,9 @@ def test_registers_of_every_size_are_written_and_read(line: Line) -> None:
     ],
 )
 def test_invalid_writes_return_the_error_of_the_emanual(line: Line, address: int, data: list[int], error: int) -> None:
-    before = bytes(line.servos[1].memory.read(0, 662))
+    before = bytes(line.servos[1].memory.read(0, 635))
     assert line.sdk.writeTxRx(line.port, 1, address, len(data), data) == (COMM_SUCCESS, error)
-    assert line.servos[1].memory.read(0, 662) == before
+    assert line.servos[1].memory.read(0, 635) == before
 
 
 def test_block_is_written_completely_or_not_at_all(line: Line) -> None:
@@ -140,96 +134,6 @@ def test_damaged_instruction_is_answered_with_a_crc_error_and_not_executed(line:
 # -- registered and group instructions -----------------------------------------------------------------------------
 
 
-def test_reg_write_is_checked_and_waits_for_action(line: Line) -> None:
-    line.sdk.action(line.port, 1)
-    line.sleep(0.01)
-    assert line.serial.read(11)[8] == StatusError.INSTRUCTION
-    assert line.sdk.regWriteTxRx(line.port, 1, 132, 4, [0] * 4) == (COMM_SUCCESS, StatusError.ACCESS)
-    assert line.read("Registered Instruction") == 0
-    assert line.sdk.regWriteTxRx(line.port, 1, 65, 1, [1]) == (COMM_SUCCESS, 0)
-    assert (line.read("LED"), line.read("Registered Instruction")) == (0, 1)
-    assert line.sdk.action(line.port, 0xFE) == COMM_SUCCESS
-    line.sleep(0.01)
-    assert (line.read("LED"), line.read("Registered Instruction")) == (1, 0)
-
-
-@pytest.mark.parametrize("fast", [False, True])
-def test_sync_read_answers_in_the_requested_order(three: Line, fast: bool) -> None:
-    for bus_id, position in ((1, 10.0), (7, 20.0), (4, 30.0)):
-        three.servos[bus_id].rotate_by_hand(position)
-    three.sleep(2.0)
-    group = GroupSyncRead(three.port, three.sdk, 132, 4)
-    for bus_id in (4, 7, 1):
-        assert group.addParam(bus_id)
-    assert (group.fastSyncRead() if fast else group.txRxPacket()) == COMM_SUCCESS
-    degrees = {bus_id: (group.getData(bus_id, 132, 4) - 2048) * 360 / 4096 for bus_id in (1, 7, 4)}
-    assert degrees == pytest.approx({1: 10, 7: 20, 4: 30}, abs=0.05)
-    replies = [frame for frame in three.frames if frame.source is Sender.DEVICE]
-    assert len(replies) == 3
-    for earlier, later in pairwise(replies):
-        assert later.start_ns >= earlier.end_ns
-
-
-@pytest.mark.parametrize("fast", [False, True])
-def test_bulk_read_reads_other_registers_of_each_servo(three: Line, fast: bool) -> None:
-    three.servos[7].set_temperature(41.0)
-    group = GroupBulkRead(three.port, three.sdk)
-    group.addParam(7, 146, 1)
-    group.addParam(1, 144, 2)
-    assert (group.fastBulkRead() if fast else group.txRxPacket()) == COMM_SUCCESS
-    assert (group.getData(7, 146, 1), group.getData(1, 144, 2)) == (41, 120)
-
-
-@pytest.mark.parametrize("instruction", [0x82, 0x8A, 0x92, 0x9A])
-@pytest.mark.parametrize("size", [65_527, 65_528, 65_531, 65_535])
-def test_read_of_more_than_a_packet_does_not_stop_the_servo(three: Line, instruction: int, size: int) -> None:
-    request = [0, 0, *word(size), 1] if instruction in (0x82, 0x8A) else [1, 0, 0, *word(size)]
-    body = bytes([instruction, *request])
-    three.bus.send(with_crc(b"\xff\xff\xfd\x00\xfe" + bytes(word(len(body) + 2)) + body), three.baudrate)
-    three.sleep(2.0)
-    assert all(len(data) <= 7 + 65_535 for data in three.sent(Sender.DEVICE))
-    assert three.sdk.ping(three.port, 1)[:2] == (1060, COMM_SUCCESS)
-
-
-def test_chain_ends_at_the_first_silent_servo(three: Line) -> None:
-    three.servos[7].power_off()
-    group = GroupSyncRead(three.port, three.sdk, 132, 4)
-    for bus_id in (1, 7, 4):
-        group.addParam(bus_id)
-    assert group.txRxPacket() == COMM_RX_TIMEOUT
-    assert [data[4] for data in three.sent(Sender.DEVICE)] == [1]
-
-
-def test_sync_write_and_bulk_write_reach_each_servo_without_an_answer(three: Line) -> None:
-    sync = GroupSyncWrite(three.port, three.sdk, 65, 1)
-    sync.addParam(1, [1])
-    sync.addParam(4, [1])
-    assert sync.txPacket() == COMM_SUCCESS
-    three.sleep(0.01)
-    assert [three.read("LED", i) for i in (1, 7, 4)] == [1, 0, 1]
-    bulk = GroupBulkWrite(three.port, three.sdk)
-    bulk.addParam(7, 112, 4, double(77))
-    bulk.addParam(1, 65, 1, [0])
-    assert bulk.txPacket() == COMM_SUCCESS
-    three.sleep(0.01)
-    assert (three.read("Profile Velocity", 7), three.read("LED", 1), three.read("LED", 4)) == (77, 0, 1)
-    answers_to_reads = 6
-    assert len(three.sent(Sender.DEVICE)) == answers_to_reads
-
-
-def test_servos_obey_a_secondary_id_without_an_answer(three: Line) -> None:
-    for bus_id in (1, 7, 4):
-        three.put(bus_id, Secondary_ID=100)
-    result, _ = three.sdk.write1ByteTxRx(three.port, 100, 65, 1)
-    assert result == COMM_RX_TIMEOUT
-    assert [three.read("LED", i) for i in (1, 7, 4)] == [1, 1, 1]
-    three.sdk.write1ByteTxRx(three.port, 100, 9, 0)  # EEPROM is closed to a group
-    assert three.read("Return Delay Time") == 250
-
-
-# -- what the servo is set to ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("level", "read", "write"), [(0, False, False), (1, True, False), (2, True, True)])
 def test_status_return_level_selects_the_answered_instructions(line: Line, level: int, read: bool, write: bool) -> None:
     line.put(Status_Return_Level=level)
@@ -248,24 +152,6 @@ def test_new_id_and_baud_rate_are_used_from_the_next_instruction(line: Line) -> 
     assert line.sdk.ping(line.port, 9)[1] == COMM_RX_TIMEOUT
     line.serial.baudrate = 115_200
     assert line.sdk.ping(line.port, 9)[1] == COMM_SUCCESS
-
-
-def test_indirect_data_reads_and_writes_the_bytes_it_points_to(line: Line) -> None:
-    assert line.sdk.write1ByteTxRx(line.port, 1, 224, 42) == (COMM_SUCCESS, 0)
-    assert line.sdk.read1ByteTxRx(line.port, 1, 224) == (42, COMM_SUCCESS, 0)
-    for i, target in enumerate((132, 133, 134, 135, 65)):
-        assert line.sdk.write2ByteTxRx(line.port, 1, 168 + 2 * i, target) == (COMM_SUCCESS, 0)
-    line.servos[1].rotate_by_hand(90.0)
-    line.sleep(3.0)
-    data, _, error = line.sdk.readTxRx(line.port, 1, 224, 5)
-    assert (int.from_bytes(bytes(data[:4]), "little"), data[4], error) == (2048 + 1024, 0, 0)
-    assert line.sdk.write1ByteTxRx(line.port, 1, 228, 1) == (COMM_SUCCESS, 0)
-    assert line.read("LED") == 1
-    assert line.sdk.write1ByteTxRx(line.port, 1, 224, 0) == (COMM_SUCCESS, StatusError.ACCESS)
-    assert line.sdk.write2ByteTxRx(line.port, 1, 168, 7) == (COMM_SUCCESS, StatusError.DATA_RANGE)  # not of EEPROM
-
-
-# -- reboot, factory reset, clear ----------------------------------------------------------------------------------
 
 
 def test_reboot_is_answered_and_resets_all_but_the_eeprom(line: Line) -> None:
@@ -288,34 +174,3 @@ def test_reboot_loses_the_revolutions(line: Line) -> None:
     line.sleep(0.5)
     assert line.read("Present Position") == 2148
     assert line.shaft() == pytest.approx(3 * 360 + 100 * 360 / 4096)
-
-
-@pytest.mark.parametrize(("option", "bus_id", "baudrate"), [(0xFF, 1, 57_600), (0x01, 5, 57_600), (0x02, 5, 1_000_000)])
-def test_factory_reset_keeps_the_registers_of_its_option(option: int, bus_id: int, baudrate: int) -> None:
-    line = Line()
-    line.add(5)
-    line.put(5, Return_Delay_Time=7, Operating_Mode=4)
-    assert line.sdk.factoryReset(line.port, 5, option) == (COMM_SUCCESS, 0)
-    line.sleep(0.5)
-    line.serial.baudrate = baudrate
-    assert line.sdk.ping(line.port, bus_id)[1] == COMM_SUCCESS
-    assert line.sdk.read1ByteTxRx(line.port, bus_id, 9)[0] == 250
-    assert line.sdk.read1ByteTxRx(line.port, bus_id, 11)[0] == 3
-
-
-def test_factory_reset_of_everything_ignores_broadcasts(line: Line) -> None:
-    line.put(Return_Delay_Time=7)
-    line.sdk.factoryReset(line.port, 0xFE, 0xFF)
-    line.sleep(0.5)
-    assert line.read("Return Delay Time") == 7
-
-
-def test_clear_resets_the_revolutions_only_while_the_servo_stands_still(line: Line) -> None:
-    extended(line, velocity=100)
-    line.put(Goal_Position=2048 + 2 * 4096)
-    line.sleep(0.5)
-    assert line.sdk.clearMultiTurn(line.port, 1) == (COMM_SUCCESS, StatusError.RESULT_FAIL)
-    line.sleep(8.0)
-    assert line.read("Present Position") == 2048 + 2 * 4096
-    assert line.sdk.clearMultiTurn(line.port, 1) == (COMM_SUCCESS, 0)
-    assert line.read("Present Position") == line.read("Goal Position") == 2048

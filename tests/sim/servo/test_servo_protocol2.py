@@ -5,14 +5,13 @@ from dynamixel_sdk import Protocol2PacketHandler
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from rig.devices.dynamixel.packets import Packets2
+from rig.devices.dynamixel.packets import Packets
 from sim.servo.protocol2 import (
     BROADCAST_ID,
     InstructionPacket,
     PacketParser,
     StatusPacket,
     crc16,
-    fast_status_parts,
     status_packet,
     with_crc,
 )
@@ -76,19 +75,6 @@ def test_status_packets_equal_the_emanuals(bus_id: int, status: StatusPacket, fr
     assert status_packet(bus_id, status) == bytes.fromhex(frame)
 
 
-def test_fast_sync_read_status_equals_the_emanuals() -> None:
-    answers = [
-        (3, StatusPacket(0, (166).to_bytes(4, "little"))),
-        (7, StatusPacket(0, (2079).to_bytes(4, "little"))),
-        (4, StatusPacket(0, (1023).to_bytes(4, "little"))),
-    ]
-    assert fast_status_parts([4, 4, 4], answers) == [
-        bytes.fromhex("FF FF FD 00 FE 19 00 55 00 03 A6 00 00 00 84 08"),
-        bytes.fromhex("00 07 1F 08 00 00 16 CA"),
-        bytes.fromhex("00 04 FF 03 00 00 D1 9E"),
-    ]
-
-
 def unstuffed(stuffed: bytes) -> bytes:
     """Return ``stuffed`` without the byte that follows each FF FF FD, left to right, as the e-manual has it."""
     plain = bytearray()
@@ -114,7 +100,7 @@ def test_byte_stuffing_removes_headers_and_can_be_undone(bus_id: int, error: int
     assert b"\xff\xff\xfd\x00" not in frame[4:-2]
     assert SDK.updateCRC(0, frame, len(frame) - 2) == frame[-2] | frame[-1] << 8
     assert unstuffed(frame[7:-2]) == bytes((0x55, error)) + data
-    assert bytes(Packets2().removeStuffing(list(frame))[7:-2]) == bytes((0x55, error)) + data
+    assert bytes(Packets().removeStuffing(list(frame))[7:-2]) == bytes((0x55, error)) + data
 
 
 @quick

@@ -1,11 +1,10 @@
 """The control table, compared with a small model of the e-manual's rules, under any sequence of instructions."""
 
-from dynamixel_sdk import COMM_SUCCESS
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from sim.servo.base import BOOT_S, OVERLOAD_ERROR
+from sim.servo.device import BOOT_S, OVERLOAD_ERROR
 from sim.servo.protocol2 import StatusError
 from tests.fuzzing import examples
 from tests.sim.servo.servo_bench import ALERT, Line
@@ -100,23 +99,6 @@ class ServoMachine(RuleBasedStateMachine):
         if expected is StatusError.NONE and self.torque and self.mode != 1:
             self.goal = goal
 
-    @rule(name=st.sampled_from(list(RAM)), value=st.integers(0, 1))
-    def register_a_write(self, name: str, value: int) -> None:
-        register = self.line.table(1)[name]
-        data = list(register.encode(value))
-        result, _ = self.line.sdk.regWriteTxRx(self.line.port, 1, register.address, register.size, data)
-        assert result == COMM_SUCCESS
-        self.waiting = name, value
-
-    @precondition(lambda self: self.waiting is not None)
-    @rule()
-    def act(self) -> None:
-        self.line.sdk.action(self.line.port, 0xFE)
-        self.line.sleep(0.005)
-        assert self.waiting is not None
-        self.keep(*self.waiting)
-        self.waiting = None
-
     @rule()
     def overload(self) -> None:
         self.servo.fail(OVERLOAD_ERROR)
@@ -131,7 +113,7 @@ class ServoMachine(RuleBasedStateMachine):
             self.servo.power_cycle()
         self.line.sleep(BOOT_S + 0.01)
         self.ram = dict(self.initial_ram)
-        self.torque, self.shut_down, self.waiting = 0, False, None
+        self.torque, self.shut_down = 0, False
         assert 0 <= self.line.read("Present Position") < 4096
 
     @rule(seconds=st.floats(0.01, 30.0))
@@ -155,7 +137,6 @@ class ServoMachine(RuleBasedStateMachine):
         assert {name: memory[name] for name in RAM} == self.ram
         assert (memory["Torque Enable"], memory["Operating Mode"]) == (self.torque, self.mode)
         assert memory["Hardware Error Status"] == (OVERLOAD_ERROR if self.shut_down else 0)
-        assert memory["Registered Instruction"] == (self.waiting is not None)
 
 
 TestServo = ServoMachine.TestCase
