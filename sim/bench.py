@@ -26,7 +26,6 @@ from sim.computer import simulated_computer
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
-from sim.faults.schedule import read_faults
 from sim.noise import NoiseModel
 from sim.objects.projection import Image
 from sim.objects.shelf import shelf
@@ -46,15 +45,16 @@ class SimOptions(Section):
         None, gt=0, le=1000, description="simulated seconds per second; default: as fast as the computer can"
     )
     noise: dict[str, Any] = Field(default_factory=dict, description="noise model: values to change")
-    faults: list[Any] = Field(
+    faults: list[str] = Field(
         default_factory=list, description='simulated faults, e.g. ["jam@move3+2s"]; rig faults lists them'
     )
 
     @field_validator("faults")
     @classmethod
-    def _readable(cls, entries: list[Any]) -> list[Any]:
+    def _readable(cls, entries: list[str]) -> list[str]:
         try:
-            read_faults(entries)
+            for entry in entries:
+                Fault.parse(entry)
         except UsageError as error:
             raise ValueError(f"{error.what} {error.next_step}") from error
         return entries
@@ -285,7 +285,7 @@ class SimBenchKind:
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
             bench = open_sim_bench(
-                stage.config, operator, faults=read_faults(options.faults), open_now=(), name=self.name
+                stage.config, operator, faults=map(Fault.parse, options.faults), open_now=(), name=self.name
             )
             bench.findings += stage.findings
             bench.connections.enter_context(held.pop_all())
@@ -302,7 +302,7 @@ class SimBenchKind:
             simulated_computer(stage.config, devices) as computer,
         ):
             faults = Faults(devices)
-            faults.schedule(*read_faults(options.faults))
+            faults.schedule(*map(Fault.parse, options.faults))
             try:
                 yield computer
             finally:

@@ -52,9 +52,6 @@ def demo(
         list[str] | None,
         typer.Option("--fault", metavar="NAME[@TIME]", help="Inject a fault: jam@move3+2s. See rig faults."),
     ] = None,
-    faults: Annotated[
-        Path | None, typer.Option("--faults", metavar="FILE", help="Inject the faults of a TOML file.")
-    ] = None,
     no_empty_table: Annotated[
         bool, typer.Option("--no-empty-table", help="Take no empty-table images before the enrollment.")
     ] = False,
@@ -71,9 +68,8 @@ def demo(
     """
     from sim.change import Change
     from sim.demo.run import run_demo
-    from sim.faults import Fault, load_faults
+    from sim.faults import Fault
 
-    planned = [*(load_faults(faults) if faults else ()), *(Fault.parse(text) for text in fault or ())]
     result = run_demo(
         settings,
         objects=objects,
@@ -82,7 +78,7 @@ def demo(
         out=out,
         strategy=strategy,
         change=Change.named(change or ()),
-        faults=planned,
+        faults=[Fault.parse(text) for text in fault or ()],
         empty_table=not no_empty_table,
     )
     if settings.json:
@@ -116,4 +112,4 @@ def faults(settings: Settings) -> None:
         for name, parameter in kind.parameters.items():
             typer.echo(f"{'':<{width}}    {name}={parameter.default:g}  {parameter.meaning}")
     typer.echo(f"\nTo inject a fault: rig demo --fault {NOTATION}.")
-    typer.echo('In a file (--faults FILE) or in rig.toml ([bench.sim]): faults = ["jam@move3+2s", "babble@20s+5s"]')
+    typer.echo('In rig.toml ([bench.sim]): faults = ["jam@move3+2s", "babble@20s+5s"]')

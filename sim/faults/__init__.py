@@ -5,6 +5,6 @@
 
 from sim.faults.injector import Faults
 from sim.faults.kind import FaultKind
-from sim.faults.schedule import Fault, fault_kinds, load_faults
+from sim.faults.schedule import Fault, fault_kinds
 
-__all__ = ["Fault", "FaultKind", "Faults", "fault_kinds", "load_faults"]
+__all__ = ["Fault", "FaultKind", "Faults", "fault_kinds"]

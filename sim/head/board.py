@@ -138,7 +138,7 @@ class SimHead:
         self._failure: BaseException | None = None
         self._running = False
 
-        self._library = _load(library or build.host_library())
+        self._library = _load(library or build.made())
         self._environment = _Environment(_I2c(self._i2c), _Edge(self._edge))
         self._outputs = ctypes.create_string_buffer(_ROOM * _OUTPUT.itemsize)
         self._board = self._library.board_open(self._environment, flash, len(flash), serial)

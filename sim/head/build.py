@@ -28,18 +28,8 @@ def missing() -> str:
     return ""
 
 
-def host_library(flags: str = "") -> Path:
-    """Return the portable core as a shared library (``boards/host``), compiled with further ``flags``."""
-    return made("libhead.so", flags)
-
-
-def pty_program() -> Path:
-    """Return the program that simulates a head on a pseudo-terminal."""
-    return made("head-pty")
-
-
-def made(product: str, flags: str = "") -> Path:
-    """Return a product of the firmware's Makefile; the core for this computer is compiled with further ``flags``.
+def made(product: str = "libhead.so", flags: str = "") -> Path:
+    """Return a product of the firmware's Makefile: by default the core for this computer, compiled with ``flags``.
 
     Raises `ConfigError` if this computer lacks a compiler, or the sources are wrong.
     """

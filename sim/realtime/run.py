@@ -21,9 +21,8 @@ from rig.safety.saved_state import BenchLock, FileStore, holder
 from sim.bench import ShelfOperator, SimOptions, new_world, rest_angle_deg
 from sim.computer import configure_servo, write_files
 from sim.devices import SimDevices
-from sim.faults import Faults
+from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
-from sim.faults.schedule import read_faults
 from sim.objects.shelf import shelf
 from sim.realtime.bench import RunningSimBench
 from sim.realtime.commands import Commands
@@ -54,7 +53,7 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         faults = Faults(devices)
         ends.callback(faults.clear)
         faults.listeners.append(lambda occurrence: _print_fault(settings, occurrence))
-        faults.schedule(*read_faults(options.faults))
+        faults.schedule(*map(Fault.parse, options.faults))
 
         # The interfaces for other programs and for the trainee.
         ports = [_port(devices.reopen_adapter, folder / SERVO, ends)]

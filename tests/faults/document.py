@@ -46,7 +46,7 @@ only a large move shows it) and an identification. Both complete or stop with th
 *Within* is the time from the beginning of the fault until the torque is off, on the bench's clock, for a fault that
 begins during move 3. A dash means that the enrollment continues and the operator does nothing.
 
-You can produce the faults on any simulated bench: `rig demo --fault jam@move3+2s`, `rig demo --faults FILE`, or
+You can produce the faults on any simulated bench: `rig demo --fault jam@move3+2s`, or
 `faults = ["jam@move3+2s"]` under `[bench.sim]` in `rig.toml`. `rig faults` lists the parameters. The notation is
 `NAME:PARAMETER=VALUE@TIME`. The time is `12s`, `move3` or `view10`, optionally with a duration: `12s+2s`. Moves and
 views are counted from 0.

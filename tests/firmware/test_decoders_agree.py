@@ -83,7 +83,7 @@ def test_both_decoders_accept_the_same_frames(compiler):
     nightly = settings.get_current_profile_name() == "nightly"
     asan = runtime("libasan.so")
     flags = "-g -fsanitize=address,undefined -fno-sanitize-recover" if asan else "-g"
-    library = build.host_library(flags)
+    library = build.made(flags=flags)
     environment = {**os.environ, "LD_PRELOAD": asan, "ASAN_OPTIONS": "detect_leaks=0"}  # Python's own are not ours
     count, seed = (NIGHTLY_LINES, os.getpid()) if nightly else (LINES, 1)
     done = subprocess.run(

@@ -56,10 +56,9 @@ def test_a_jam_asks_for_an_acknowledgement_only_where_a_fault_stays_latched(stor
     assert (acknowledged is not None) == stored
 
 
-def test_changed_bench_is_searched_with_the_faults_of_file_command_line_and_configuration(tmp_path):
-    (tmp_path / "faults.toml").write_text('faults = ["crc_flip@1s+3s"]')
+def test_changed_bench_is_searched_with_the_faults_of_command_line_and_configuration(tmp_path):
     done = rig(
-        *("demo", *SMALL, "--faults", str(tmp_path / "faults.toml"), "--fault", "camera.slow@2s+1s"),
+        *("demo", *SMALL, "--fault", "crc_flip@1s+3s", "--fault", "camera.slow@2s+1s"),
         *("--set", 'bench.sim.faults=["i2c_nack@3s+1s"]', "--out", str(tmp_path / "out")),
         *("--views", "5", "--change", "bench"),
     )
@@ -82,7 +81,6 @@ def test_faults_of_the_configuration_apply_to_every_command():
     [
         (("--fault", "jamm"), "Did you mean jam?"),
         (("--fault", "jam@noon"), "12s, move3 or view10"),
-        (("--faults", "nowhere.toml"), "nowhere.toml"),
         (("--set", 'bench.sim.faults=["jamm"]'), "Did you mean jam?"),
     ],
 )

@@ -61,7 +61,7 @@ def test_opening_reads_the_identity_and_leaves_outputs_off(opened, request):
 def test_version_mismatch_names_the_side_to_update(version, step):
     needs("memory")
     world = World()
-    head = SimHead(world, library=build.host_library(f"-DPROTOCOL_VERSION={version}"))
+    head = SimHead(world, library=build.made(flags=f"-DPROTOCOL_VERSION={version}"))
     with pytest.raises(FirmwareMismatch) as caught:
         RigHead(HeadSerial(head), world.clock, mpu6050())
     assert step in caught.value.next_step

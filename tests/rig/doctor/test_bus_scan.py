@@ -20,8 +20,7 @@ from rig.doctor.bus_scan import BAUD_RATES, BaudScan, scan_imus, scan_servos, wi
 from rig.doctor.device_scan import DeviceScan, FoundCamera, camera_settings
 from rig.doctor.examination import run_checks
 from rig.doctor.finding import FindingCode, Severity
-from sim.faults import Faults
-from sim.faults.schedule import read_faults
+from sim.faults import Fault, Faults
 from tests.fuzzing import fuzz_settings
 from tests.rig.doctor.doctor_parts import unopened
 
@@ -74,7 +73,7 @@ def test_duplicate_id_is_found_beside_another_servo(bench):
 @pytest.mark.parametrize(("fault", "ids", "noise"), [("babble", [], True), ("echo", [1], False)])
 def test_babbling_bus_is_noise_and_an_echo_changes_nothing(fault, ids, noise, bench):
     faults = Faults(bench.devices)
-    faults.schedule(*read_faults([fault]))
+    faults.schedule(Fault.parse(fault))
     (said,) = heard(bench, 57_600)
     faults.clear()
     assert [servo.bus_id for servo in said.servos] == ids

@@ -16,8 +16,7 @@ from rig.doctor.checks import CHECKS
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.examination import Check, run_checks
 from rig.doctor.finding import Finding, FindingCode, Severity, finding_words, fine
-from sim.faults import Faults, fault_kinds
-from sim.faults.schedule import read_faults
+from sim.faults import Fault, Faults, fault_kinds
 from tests.rig.catalog.catalog_samples import fill
 from tests.rig.doctor.doctor_parts import unopened
 
@@ -160,7 +159,7 @@ INVISIBLE = sorted(fault_kinds().keys() - FOUND.keys())
 def test_all_checks_end_under_every_fault_and_find_visible_ones(name, bench):
     set_up(bench)
     faults = Faults(bench.devices)
-    faults.schedule(*read_faults([name]))
+    faults.schedule(Fault.parse(name))
     seen = name.startswith("camera") or name in IN_IMAGES
     findings = bench.findings("port", "servo", "imu", "clock", *(["camera"] if seen else []))
     faults.clear()

@@ -6,8 +6,7 @@ import pytest
 from rig.core.next_steps import Do
 from rig.doctor.camera import mains_flicker, standing_flicker, standing_mains_hz
 from rig.doctor.finding import FindingCode
-from sim.faults import Faults
-from sim.faults.schedule import read_faults
+from sim.faults import Fault, Faults
 from tests.rig.doctor.doctor_parts import unopened
 
 
@@ -70,23 +69,23 @@ def test_exposure_is_a_whole_number_of_periods():
 
 def test_doctor_names_the_mains_and_the_exposure_that_hides_it():
     with unopened("camera.exposure_us=5000") as bench:
-        Faults(bench.devices).schedule(*read_faults(["mains_flicker"]))
+        Faults(bench.devices).schedule(Fault.parse("mains_flicker"))
         found = bench.problems("camera")
         assert found == {FindingCode.MAINS_FLICKER: (Do.SET_KEY(key="camera.exposure_us", value="10000"),)}
     with unopened() as bench:  # the default of 10 ms
-        Faults(bench.devices).schedule(*read_faults(["mains_flicker"]))
+        Faults(bench.devices).schedule(Fault.parse("mains_flicker"))
         assert bench.problems("camera") == {}
 
 
 def test_doctor_names_the_mains_whose_bands_stand_still():
     fault = ["mains_flicker:hz=60"]  # 120 Hz is four times the frame rate
     with unopened() as bench:
-        Faults(bench.devices).schedule(*read_faults(fault))
+        Faults(bench.devices).schedule(*map(Fault.parse, fault))
         before = bench.devices.camera.exposure
         assert bench.problems("camera") == {
             FindingCode.MAINS_FLICKER: (Do.SET_KEY(key="camera.exposure_us", value="8333"),)
         }
         assert bench.devices.camera.exposure == before
     with unopened("camera.exposure_us=8333") as bench:
-        Faults(bench.devices).schedule(*read_faults(fault))
+        Faults(bench.devices).schedule(*map(Fault.parse, fault))
         assert bench.problems("camera") == {}
