@@ -5,7 +5,8 @@ bus is open, calls on its file go to the bus and all others to the kernel, so a 
 sysfs with the adapter's name is replaced in the same way.
 
 Transactions follow the kernel's user interface (Documentation/i2c/{dev-interface,smbus-protocol,fault-codes}.rst). Not
-simulated: ten-bit addresses, packet error checking, several masters. A device that stretches the clock (its attribute
+simulated: ten-bit addresses, packet error checking, several masters, and the protocols of SMBus in which the device
+sends the length of a block. A device that stretches the clock (its attribute
 ``stretches``) is a problem only for a controller that does not wait, see `SimI2cBus.stretch_errors`.
 """
 
@@ -15,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from errno import EBUSY, EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
+from errno import EBUSY, EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EREMOTEIO, ETIMEDOUT
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,16 +30,14 @@ BIT_NS = 2_500  # one bit at 400 kHz (fast mode); a byte takes nine, with its ac
 _SLOW_BIT_NS = 50_000  # at 20 kHz or less, a stretch ends within its bit
 TIMEOUT_S = 1.0  # how long the kernel waits for a bus that hangs (the default of ``i2c_adapter.timeout``)
 
-FUNCTIONS = (
-    smbus.I2cFunc.SMBUS_EMUL
-    | smbus.I2cFunc.SMBUS_READ_BLOCK_DATA
-    | smbus.I2cFunc.I2C
-    | smbus.I2cFunc.SMBUS_BLOCK_PROC_CALL
-) & ~smbus.I2cFunc.SMBUS_PEC
-"""Capabilities of the adapter, for the ioctl I2C_FUNCS."""
+_LACKING = smbus.I2cFunc.SMBUS_PEC | smbus.I2cFunc.SMBUS_PROC_CALL | smbus.I2cFunc.SMBUS_WRITE_BLOCK_DATA
+_FUNCTIONS = (smbus.I2cFunc.SMBUS_EMUL | smbus.I2cFunc.I2C) & ~_LACKING
 
 _MAX_MESSAGES = 42  # I2C_RDWR_IOCTL_MAX_MSGS and the kernel's largest message: i2c-dev rejects more, so this bus does
 _MAX_MESSAGE_LENGTH = 8192
+
+Messages = Sequence[tuple[int, bytes | int]]
+"""The messages of a transaction: an address, and the bytes to write or the number of bytes to read."""
 
 
 class I2cDevice(Protocol):
@@ -75,35 +74,15 @@ class I2cMessage:
     data: bytes
 
 
-class SimI2cBus(AbstractContextManager["SimI2cBus"]):
-    """A bus with a path that ``smbus2.SMBus(path)`` opens.
+class KernelBus(AbstractContextManager["KernelBus"]):
+    """What the kernel does with the calls on the device file of a bus: it makes messages of them.
 
-    Tests use `attach`, `detach` (unplug), `nack`, `nack_conditions` (called with an address; True: no acknowledge),
-    `cut_read`, `stuck`, `stuck_error` (ETIMEDOUT as the adapter of a Raspberry Pi, or EIO as an i2c-tiny-usb), `name`
-    (the kernel's name of the adapter), `kernel_drivers` (addresses that a kernel driver uses), `errors` (address to the
-    number of the error at each transfer), and `wire`, the last acknowledged messages. `bit_ns` is the time of a bit.
-    `held` returns when the computer is ready for a transfer that is due at a time, in ns.
-    `stretch_errors` is the share of reads in which the controller does not wait for a stretched clock, as that of a
-    Raspberry Pi 4 does above 20 kHz: it takes a bit too early, and all later bits are late by one.
+    ``smbus2.SMBus(path)`` opens the bus. ``kernel_drivers`` are the addresses that a kernel driver uses.
     """
 
-    def __init__(self, clock: VirtualClock) -> None:
-        self._clock = clock
-        self._devices: dict[int, I2cDevice] = {}
-        self._addressed: dict[int, int] = {}
-        self._nacks = 0
-        self._cut: int | None = None
-        self.name = ""
-        self.stuck = False
-        self.stuck_error = ETIMEDOUT
-        self.bit_ns = BIT_NS
-        self.held: Callable[[int], int] = int
-        self.stretch_errors = 0.0
-        self._rng = np.random.default_rng(0)
+    def __init__(self) -> None:
         self.kernel_drivers: set[int] = set()
-        self.errors: dict[int, int] = {}
-        self.nack_conditions: list[Callable[[int], bool]] = []
-        self.wire: deque[I2cMessage] = deque(maxlen=1000)
+        self._addressed: dict[int, int] = {}
         self._file = RoutedFile(self)
         self.path = self._file.path
 
@@ -113,6 +92,100 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     def close(self) -> None:
         """Remove the bus; a second call does nothing."""
         self._file.close()
+
+    def transfer(self, messages: Messages) -> list[bytes]:
+        """Transfer messages and a stop; return the bytes of each read. Raises OSError with the kernel's number."""
+        raise NotImplementedError
+
+    def ioctl(self, fd: int, request: int, argument: Any) -> int:
+        """Serve one ``ioctl`` of ``/dev/i2c-N``; raises OSError with the kernel's number."""
+        match request:
+            case smbus.I2C_FUNCS:
+                argument.value = _FUNCTIONS
+            case smbus.I2C_SLAVE | smbus.I2C_SLAVE_FORCE:
+                if not 0 <= argument <= 0x7F:
+                    raise _os_error(EINVAL)
+                if request == smbus.I2C_SLAVE and argument in self.kernel_drivers:
+                    raise _os_error(EBUSY)
+                self._addressed[fd] = argument
+            case smbus.I2C_PEC:
+                if argument:
+                    raise _os_error(EOPNOTSUPP)
+            case smbus.I2C_SMBUS:
+                self._smbus(self._addressed.get(fd, 0), argument)
+            case smbus.I2C_RDWR:
+                messages = [argument.msgs[i] for i in range(argument.nmsgs)]
+                reading = [m for m in messages if m.flags & smbus.I2C_M_RD]
+                contents = [m.len if m in reading else ctypes.string_at(m.buf, m.len) for m in messages]
+                read = self.transfer(list(zip((m.addr for m in messages), contents, strict=True)))
+                for m, data in zip(reading, read, strict=True):
+                    ctypes.memmove(m.buf, data, len(data))
+            case _:
+                raise _os_error(ENOTTY)
+        return 0
+
+    def _smbus(self, address: int, message: Any) -> None:
+        reading = message.read_write == smbus.I2C_SMBUS_READ
+        command, data = bytes([message.command]), message.data.contents
+
+        def write(sent: bytes) -> None:
+            self.transfer([(address, sent)])
+
+        def read(count: int, *, of_register: bool = True) -> bytes:
+            return self.transfer([*([(address, command)] if of_register else []), (address, count)])[-1]
+
+        match message.size:
+            case smbus.I2C_SMBUS_QUICK:
+                self.transfer([(address, 0 if reading else b"")])
+            case smbus.I2C_SMBUS_BYTE if reading:
+                data.byte = read(1, of_register=False)[0]
+            case smbus.I2C_SMBUS_BYTE:
+                write(command)
+            case smbus.I2C_SMBUS_BYTE_DATA if reading:
+                data.byte = read(1)[0]
+            case smbus.I2C_SMBUS_BYTE_DATA:
+                write(command + bytes([data.byte]))
+            case smbus.I2C_SMBUS_WORD_DATA if reading:
+                data.word = int.from_bytes(read(2), "little")
+            case smbus.I2C_SMBUS_WORD_DATA:
+                write(command + data.word.to_bytes(2, "little"))
+            case smbus.I2C_SMBUS_I2C_BLOCK_DATA if reading:
+                count = _length(data)
+                data.block[1 : count + 1] = list(read(count))
+            case smbus.I2C_SMBUS_I2C_BLOCK_DATA:
+                write(command + bytes(data.block[1 : _length(data) + 1]))
+            case _:
+                raise _os_error(EOPNOTSUPP)
+
+
+class SimI2cBus(KernelBus):
+    """A bus with simulated devices.
+
+    Tests use `attach`, `detach` (unplug), `nack`, `nack_conditions` (called with an address; True: no acknowledge),
+    `cut_read`, `stuck`, `stuck_error` (ETIMEDOUT as the adapter of a Raspberry Pi, or EIO as an i2c-tiny-usb), `name`
+    (the kernel's name of the adapter), `errors` (address to the
+    number of the error at each transfer), and `wire`, the last acknowledged messages. `bit_ns` is the time of a bit.
+    `held` returns when the computer is ready for a transfer that is due at a time, in ns.
+    `stretch_errors` is the share of reads in which the controller does not wait for a stretched clock, as that of a
+    Raspberry Pi 4 does above 20 kHz: it takes a bit too early, and all later bits are late by one.
+    """
+
+    def __init__(self, clock: VirtualClock) -> None:
+        super().__init__()
+        self._clock = clock
+        self._devices: dict[int, I2cDevice] = {}
+        self._nacks = 0
+        self._cut: int | None = None
+        self.name = ""
+        self.stuck = False
+        self.stuck_error = ETIMEDOUT
+        self.bit_ns = BIT_NS
+        self.held: Callable[[int], int] = int
+        self.stretch_errors = 0.0
+        self._rng = np.random.default_rng(0)
+        self.errors: dict[int, int] = {}
+        self.nack_conditions: list[Callable[[int], bool]] = []
+        self.wire: deque[I2cMessage] = deque(maxlen=1000)
 
     # -- world side -----------------------------------------------------------------------------------------------
 
@@ -135,123 +208,43 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         """Interrupt the next read of more than ``after_bytes`` bytes after that number of bytes."""
         self._cut = after_bytes
 
-    # -- bus side: for an adapter that transfers single messages --------------------------------------------------
+    # -- bus side -------------------------------------------------------------------------------------------------
+
+    def transfer(self, messages: Messages) -> list[bytes]:
+        sizes = [content if isinstance(content, int) else len(content) for _, content in messages]
+        if not 0 < len(sizes) <= _MAX_MESSAGES or max(sizes) > _MAX_MESSAGE_LENGTH:
+            raise _os_error(EINVAL)
+        self._clock.advance_to(self.held(self._clock.now_ns()))
+        if self.stuck:
+            self._clock.sleep(TIMEOUT_S)
+            raise _os_error(self.stuck_error)
+        return self._transaction(messages)
 
     def message(self, address: int, content: bytes | int, *, last: bool) -> bytes:
-        """Transfer one message: write the bytes ``content``, or read a number of bytes; a stop follows the ``last``.
+        """Transfer one message for an adapter that transfers them singly; a stop follows the ``last``.
 
         Raises OSError with the kernel's number for what happened on the wire: ETIMEDOUT at once if the bus hangs.
         """
         if self.stuck:
             raise _os_error(ETIMEDOUT)
-        read = b""
-
-        def transfer() -> None:
-            nonlocal read
-            if isinstance(content, int):
-                read = self._read(address, content)
-            else:
-                self._write(address, content)
-
-        self._transaction(transfer, stops=last)
-        return read
-
-    # -- bus side: what the kernel does ---------------------------------------------------------------------------
-
-    def ioctl(self, fd: int, request: int, argument: Any) -> int:
-        """Serve one ``ioctl`` of ``/dev/i2c-N``; raises OSError with the kernel's number."""
-        match request:
-            case smbus.I2C_FUNCS:
-                argument.value = FUNCTIONS
-            case smbus.I2C_SLAVE | smbus.I2C_SLAVE_FORCE:
-                if not 0 <= argument <= 0x7F:
-                    raise _os_error(EINVAL)
-                if request == smbus.I2C_SLAVE and argument in self.kernel_drivers:
-                    raise _os_error(EBUSY)
-                self._addressed[fd] = argument
-            case smbus.I2C_PEC:
-                if argument:
-                    raise _os_error(EOPNOTSUPP)
-            case smbus.I2C_SMBUS:
-                self._transaction(lambda: self._smbus(self._addressed.get(fd, 0), argument))
-            case smbus.I2C_RDWR:
-                messages = [argument.msgs[i] for i in range(argument.nmsgs)]
-                if not 0 < len(messages) <= _MAX_MESSAGES or any(m.len > _MAX_MESSAGE_LENGTH for m in messages):
-                    raise _os_error(EINVAL)
-                self._transaction(lambda: self._combined(messages))
-            case _:
-                raise _os_error(ENOTTY)
-        return 0
-
-    def _transaction(self, messages: Callable[[], None], *, stops: bool = True) -> None:
         self._clock.advance_to(self.held(self._clock.now_ns()))
-        if self.stuck:
-            self._clock.sleep(TIMEOUT_S)
-            raise _os_error(self.stuck_error)
+        return b"".join(self._transaction([(address, content)], stops=last))
+
+    def _transaction(self, messages: Messages, *, stops: bool = True) -> list[bytes]:
+        read = []
         try:
-            messages()
+            for address, content in messages:
+                if isinstance(content, int):
+                    read.append(self._read(address, content))
+                else:
+                    self._write(address, content)
         except OSError:
             stops = True
             raise
         finally:
             for device in list(self._devices.values()) if stops else ():
                 device.stop()
-
-    def _combined(self, messages: list[Any]) -> None:
-        for m in messages:
-            if m.flags & smbus.I2C_M_RD:
-                ctypes.memmove(m.buf, self._read(m.addr, m.len), m.len)
-            else:
-                self._write(m.addr, ctypes.string_at(m.buf, m.len))
-
-    def _smbus(self, address: int, message: Any) -> None:
-        reading = message.read_write == smbus.I2C_SMBUS_READ
-        command, data = bytes([message.command]), message.data.contents
-        match message.size:
-            case smbus.I2C_SMBUS_QUICK:
-                self._start(address, reading)
-            case smbus.I2C_SMBUS_BYTE if reading:
-                data.byte = self._read(address, 1)[0]
-            case smbus.I2C_SMBUS_BYTE:
-                self._write(address, command)
-            case smbus.I2C_SMBUS_BYTE_DATA if reading:
-                data.byte = self._write_read(address, command, 1)[0]
-            case smbus.I2C_SMBUS_BYTE_DATA:
-                self._write(address, command + bytes([data.byte]))
-            case smbus.I2C_SMBUS_WORD_DATA if reading:
-                data.word = int.from_bytes(self._write_read(address, command, 2), "little")
-            case smbus.I2C_SMBUS_WORD_DATA:
-                self._write(address, command + data.word.to_bytes(2, "little"))
-            case smbus.I2C_SMBUS_PROC_CALL:
-                sent = command + data.word.to_bytes(2, "little")
-                data.word = int.from_bytes(self._write_read(address, sent, 2), "little")
-            case smbus.I2C_SMBUS_BLOCK_DATA if reading:
-                self._read_counted(address, command, data.block)
-            case smbus.I2C_SMBUS_BLOCK_DATA:
-                self._write(address, command + bytes(data.block[: _length(data) + 1]))
-            case smbus.I2C_SMBUS_BLOCK_PROC_CALL:
-                self._read_counted(address, command + bytes(data.block[: _length(data) + 1]), data.block)
-            case smbus.I2C_SMBUS_I2C_BLOCK_DATA if reading:
-                count = _length(data)
-                data.block[1 : count + 1] = list(self._write_read(address, command, count))
-            case smbus.I2C_SMBUS_I2C_BLOCK_DATA:
-                self._write(address, command + bytes(data.block[1 : _length(data) + 1]))
-            case _:
-                raise _os_error(EOPNOTSUPP)
-
-    def _write_read(self, address: int, sent: bytes, count: int) -> bytes:
-        self._write(address, sent)
-        return self._read(address, count)
-
-    def _read_counted(self, address: int, sent: bytes, block: Any) -> None:
-        """Read a block whose first byte is its length (``I2C_M_RECV_LEN``)."""
-        self._write(address, sent)
-        count = self._read(address, 1)[0]
-        if not 1 <= count <= smbus.I2C_SMBUS_BLOCK_MAX:
-            raise _os_error(EPROTO)
-        block[: count + 1] = [count, *self._clock_out(self._devices[address], address, count)]
-
-    # -- the wire -------------------------------------------------------------------------------------------------
+        return read
 
     def _start(self, address: int, reading: bool) -> I2cDevice:
         self._pass(1)
@@ -273,9 +266,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
             raise _os_error(EREMOTEIO)
 
     def _read(self, address: int, count: int) -> bytes:
-        return self._clock_out(self._start(address, reading=True), address, count)
-
-    def _clock_out(self, device: I2cDevice, address: int, count: int) -> bytes:
+        device = self._start(address, reading=True)
         cut, moved = self._cut, count
         if cut is not None and count > cut:
             self._cut, moved = None, cut
@@ -309,22 +300,15 @@ def _os_error(number: int) -> OSError:
 _FileKey = tuple[int, int]
 _seam: Any = smbus
 _sysfs: Any = i2c
-_routed: "dict[_FileKey, Adapter]" = {}
+_routed: dict[_FileKey, KernelBus] = {}
 _kernel_ioctl: Any = None
 _kernel_name = i2c.adapter_name
 
 
-class Adapter(Protocol):
-    """Answers the ``ioctl`` calls on the device file of an I2C bus."""
-
-    def ioctl(self, fd: int, request: int, argument: Any) -> int:
-        """Serve one call; raises OSError with the kernel's number."""
-
-
 class RoutedFile:
-    """A file at ``path`` whose ``ioctl`` calls go to an adapter when smbus2 opens it."""
+    """A file at ``path`` whose ``ioctl`` calls go to a simulated bus when smbus2 opens it."""
 
-    def __init__(self, adapter: Adapter) -> None:
+    def __init__(self, adapter: KernelBus) -> None:
         global _kernel_ioctl
         self._fd: int | None = os.memfd_create("sim-i2c")  # without a name, so that a killed program leaves no file
         self.path = f"/dev/fd/{self._fd}"

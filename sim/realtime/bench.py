@@ -1,15 +1,14 @@
 """The bench ``sim-bench``: the drivers of a real bench, connected to a simulated bench that another program runs."""
 
-import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from errno import EINVAL, EIO, EOPNOTSUPP
+from errno import EIO
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import smbus2.smbus2 as smbus
 from pydantic import BaseModel, Field
 
 from rig.bench import BenchKind
@@ -22,7 +21,7 @@ from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.opencv_capture import Capture
 from rig.safety.saved_state import holder
 from sim.camera import CAMERA_DEVICE
-from sim.i2c import FUNCTIONS, RoutedFile
+from sim.i2c import KernelBus, Messages
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, Wire, not_running
 
 
@@ -86,61 +85,30 @@ def camera_node(folder: Path) -> tuple[int, ...] | None:
     return None if node is None else (int(node),)
 
 
-class RemoteI2c:
-    """The simulated bench's I2C bus; smbus2 opens ``path``. Opens its connection at the first transfer."""
+class RemoteI2c(KernelBus):
+    """The simulated bench's I2C bus. Opens its connection at the first transfer."""
 
     def __init__(self, folder: Path) -> None:
+        super().__init__()
         self._folder = folder
         self._wire: Wire | None = None
-        self._addressed: dict[int, int] = {}
-        self._file = RoutedFile(self)
-        self.path = self._file.path
 
     def close(self) -> None:
-        """Remove the bus; a second call does nothing."""
-        self._file.close()
+        super().close()
         if self._wire is not None:
             self._wire.close()
 
-    def ioctl(self, fd: int, request: int, argument: Any) -> int:
-        """Serve one ``ioctl`` of ``/dev/i2c-N``; raises OSError with the kernel's number."""
-        address = self._addressed.get(fd, 0)
-        match request:
-            case smbus.I2C_FUNCS:
-                argument.value = FUNCTIONS
-            case smbus.I2C_SLAVE | smbus.I2C_SLAVE_FORCE:
-                self._addressed[fd] = argument
-            case smbus.I2C_SMBUS:
-                data = argument.data.contents
-                kind = [argument.read_write, argument.command, argument.size]
-                received = self._transfer(address, smbus=kind, data=bytes(data).hex())
-                ctypes.memmove(argument.data, received, len(received))
-            case smbus.I2C_RDWR:
-                messages = [argument.msgs[i] for i in range(argument.nmsgs)]
-                texts = [None if m.flags & smbus.I2C_M_RD else ctypes.string_at(m.buf, m.len).hex() for m in messages]
-                given = [[m.addr, m.len, text] for m, text in zip(messages, texts, strict=True)]
-                received = self._transfer(address, messages=given)
-                for message in messages:
-                    if message.flags & smbus.I2C_M_RD:
-                        ctypes.memmove(message.buf, received, message.len)
-                        received = received[message.len :]
-            case smbus.I2C_PEC if argument:
-                raise OSError(EOPNOTSUPP, os.strerror(EOPNOTSUPP))
-            case smbus.I2C_PEC:
-                pass
-            case _:
-                raise OSError(EINVAL, os.strerror(EINVAL))
-        return 0
-
-    def _transfer(self, address: int, **transfer: Any) -> bytes:
+    def transfer(self, messages: Messages) -> list[bytes]:
+        given = [[address, one if isinstance(one, int) else one.hex()] for address, one in messages]
         try:
             self._wire = self._wire or Wire(self._folder)
-            answer, received = self._wire.ask(ask="i2c", address=address, **transfer)
+            answer, received = self._wire.ask(ask="i2c", messages=given)
         except (DeviceNotFound, OSError, ValueError) as error:
             raise OSError(EIO, os.strerror(EIO)) from error
         if answer["errno"]:
             raise OSError(answer["errno"], os.strerror(answer["errno"]))
-        return received
+        ends = list(accumulate(one for _, one in messages if isinstance(one, int)))
+        return [received[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
 
 class SimBenchOptions(Section):

@@ -4,18 +4,16 @@ A request is one line of JSON. The answer is also one line of JSON, followed by 
 ``bytes``. An invalid request ends only its own connection.
 """
 
-import ctypes
 import json
 import socket
 import socketserver
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
-import smbus2.smbus2 as smbus
 
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.files import json_values
@@ -27,7 +25,6 @@ from sim.realtime.pace import RealTime
 from sim.realtime.wire import SOCKET, short_path
 
 MAX_LINE: Final = 100_000  # longer than all commands: a program that sends something else must not fill the memory
-MAX_MESSAGES, MAX_MESSAGE_BYTES = 42, 8192
 MAX_CONNECTIONS: Final = 64  # each has a thread; a program that never closes its connections is noticed
 _POLL_S: Final = 0.05
 """Period with which the wait for a frame checks whether the camera was unplugged."""
@@ -56,8 +53,8 @@ class ClientSession:
                     answer = run(self._bench.commands, words)
                 with self._time.present():  # a port that was unplugged has disappeared before the answer
                     return answer, b""
-            case {"ask": "i2c", "address": int(address), **rest}:
-                return self._i2c(address, rest)
+            case {"ask": "i2c", "messages": [*messages]}:
+                return self._i2c(messages)
             case {"ask": "camera", "call": "open"}:
                 return self._open_camera(), b""
             case {"ask": "camera", "call": "node"}:
@@ -137,51 +134,29 @@ class ClientSession:
 
     # -- I2C --------------------------------------------------------------------------------------------------------
 
-    def _i2c(self, address: int, rest: Mapping[object, Any]) -> Answer:
+    def _i2c(self, messages: list[Any]) -> Answer:
         bus = self._devices.i2c
         if not isinstance(bus, SimI2cBus):
             raise InvalidRequest
-        transfer, received = _transfer(rest)
+        transfer = [_message(*each) for each in messages if isinstance(each, list) and len(each) == 2]
+        if len(transfer) < len(messages):
+            raise InvalidRequest
         with self._time.present():
             try:
-                bus.ioctl(id(self), smbus.I2C_SLAVE, address)
-                bus.ioctl(id(self), *transfer)
+                answer: Answer = {"errno": 0}, b"".join(bus.transfer(transfer))
             except OSError as error:
-                answer: Answer = {"errno": error.errno}, b""
-            else:
-                answer = {"errno": 0}, received()
+                answer = {"errno": error.errno}, b""
         self._time.wait()  # a transfer takes time
         return answer
 
 
-def _transfer(rest: Mapping[object, Any]) -> tuple[tuple[int, Any], Callable[[], bytes]]:
-    """Return the arguments of the ``ioctl``, and a function that returns the bytes that were read."""
-    match rest:
-        case {"smbus": [int(direction), int(command), int(size)], "data": str(text)}:
-            sent, data = bytes.fromhex(text), smbus.union_i2c_smbus_data()
-            if len(sent) != ctypes.sizeof(data) or not all(0 <= n < 256 for n in (direction, command, size)):
-                raise InvalidRequest
-            ctypes.memmove(ctypes.pointer(data), sent, len(sent))
-            argument = smbus.i2c_smbus_ioctl_data(
-                read_write=direction, command=command, size=size, data=ctypes.pointer(data)
-            )
-            return (smbus.I2C_SMBUS, argument), lambda: bytes(data)
-        case {"messages": [*given]} if 0 < len(given) <= MAX_MESSAGES:
-            messages = [_message(*each) for each in given if isinstance(each, list) and len(each) == 3]
-            if len(messages) < len(given):
-                raise InvalidRequest
-            combined = smbus.i2c_rdwr_ioctl_data.create(*messages)
-            return (smbus.I2C_RDWR, combined), lambda: b"".join(bytes(m) for m in messages if m.flags & smbus.I2C_M_RD)
-    raise InvalidRequest
-
-
-def _message(address: Any, count: Any, text: Any) -> Any:
-    """Return a message that writes the bytes in ``text``, or reads ``count`` bytes if there is no text."""
-    match address, count, text:
-        case int(), int(), None if 0 <= address < 128 and 0 <= count <= MAX_MESSAGE_BYTES:
-            return smbus.i2c_msg.read(address, count)
-        case int(), int(), str() if 0 <= address < 128 and len(text) <= 2 * MAX_MESSAGE_BYTES:
-            return smbus.i2c_msg.write(address, list(bytes.fromhex(text)))
+def _message(address: Any, content: Any) -> tuple[int, bytes | int]:
+    """Return a message that writes the bytes in a text, or reads a number of bytes."""
+    match address, content:
+        case int(), int() if 0 <= address < 128 and content >= 0:
+            return address, content
+        case int(), str() if 0 <= address < 128:
+            return address, bytes.fromhex(content)
     raise InvalidRequest
 
 
