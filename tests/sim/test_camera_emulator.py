@@ -75,12 +75,6 @@ def test_exposure_and_light_act_linearly(factor: float) -> None:
     assert frame(camera(world)).mean(axis=(0, 1)) == pytest.approx([80 * factor, 80, 80], abs=0.5)
 
 
-def test_gain_is_in_decibel() -> None:
-    world = World(noise=QUIET)
-    world.put(grey(60))
-    np.testing.assert_allclose(frame(camera(world, GAIN=6)), 60 * 10 ** (6 / 20), atol=0.5)
-
-
 def test_white_balance_scales_the_channels() -> None:
     world = World(noise=QUIET)
     for level in (60, 120):
@@ -93,19 +87,6 @@ def test_white_balance_scales_the_channels() -> None:
     assert white_balance(5000) == pytest.approx((1, 1, 1))
     blue, green, red = white_balance(3500)  # tungsten light lacks blue, so the camera adds it
     assert blue > green > red
-
-
-def test_wrong_focus_blurs() -> None:
-    world = World(noise=QUIET)
-    world.put(Spot())
-    capture = camera(world)
-    _, sharp = centre(frame(capture))
-    capture.set(cv2.CAP_PROP_AUTOFOCUS, 0)
-    capture.set(cv2.CAP_PROP_FOCUS, 40)
-    assert centre(frame(capture))[1] > 1.3 * sharp
-    capture.set(cv2.CAP_PROP_AUTOFOCUS, 1)
-    world.clock.sleep(2)
-    assert centre(frame(capture))[1] == pytest.approx(sharp, rel=0.05)
 
 
 def test_vignetting_darkens_the_corners_by_its_share() -> None:
@@ -143,24 +124,6 @@ def test_variance_grows_with_the_signal_as_shot_noise_does() -> None:
         assert variance(noise, level) == pytest.approx(volts * level + (volts * 20) ** 2, rel=0.03)
     # The gain amplifies signal and noise alike: the same electrons, four times the variance.
     assert variance(noise, 50, GAIN=6) == pytest.approx(10**0.6 * variance(noise, 50), rel=0.05)
-
-
-def test_either_noise_can_be_switched_off() -> None:
-    assert variance(QUIET.with_values(read_noise_e=60), 40) == pytest.approx((60 * 255 / 10000) ** 2, rel=0.05)
-    assert variance(QUIET.with_values(read_noise_e=60), 200) == pytest.approx((60 * 255 / 10000) ** 2, rel=0.05)
-    assert variance(QUIET.with_values(full_well_e=2000), 100) == pytest.approx(100 * 255 / 2000, rel=0.03)
-    world = World(noise=QUIET)
-    world.put(grey(77))
-    assert (frame(camera(world)) == 77).all()
-
-
-def test_noise_is_new_in_every_frame() -> None:
-    world = World(noise=QUIET.with_values(full_well_e=4000))
-    world.put(grey(120))
-    capture = camera(world)
-    frames = [frame(capture)[::3, ::3].ravel() - 120 for _ in range(6)]
-    correlation = np.corrcoef(frames)
-    assert np.abs(correlation[~np.eye(6, dtype=bool)]).max() < 0.03
 
 
 def test_same_seed_gives_the_same_bytes_for_any_number_of_frames() -> None:

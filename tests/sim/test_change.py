@@ -46,18 +46,6 @@ def test_light_change_affects_only_exposure_and_colour() -> None:
     assert np.abs(middle - 1).max() > 0.05
 
 
-def test_placement_change_moves_the_object_but_not_the_light() -> None:
-    before, after = _seen(CHANGES["placement"], seed=1)
-    assert np.array_equal(before[:20], after[:20])
-    assert not np.array_equal(before, after)
-
-
-def test_bench_change_has_another_wall() -> None:
-    before, after = _seen(CHANGES["bench"], seed=1, name=None)
-    assert before[:100].std(axis=(0, 1)).max() < 2
-    assert after[:100].std(axis=(0, 1)).max() > 8
-
-
 def test_hard_change_is_that_of_the_evaluation_and_new_for_each_object() -> None:
     world = World(noise=NoiseModel.none(), seed=3)
     operator = ShelfOperator(world, shelf(), next_object="toy-house", yaw_deg=0.0)
@@ -75,12 +63,6 @@ def test_hard_change_is_that_of_the_evaluation_and_new_for_each_object() -> None
     assert empty[:100].std(axis=(0, 1)).max() > 8
     assert np.abs(frames[0].astype(int) - frames[1]).mean() > 2  # another light and placement
     assert (np.abs(frames[0].astype(int) - empty).max(axis=2) > 40).mean() > 0.05  # the object
-
-
-def test_change_depends_on_the_seed() -> None:
-    one, again, other = (_seen(CHANGES["bench"], seed)[1] for seed in (1, 1, 2))
-    assert np.array_equal(one, again)
-    assert not np.array_equal(one, other)
 
 
 def test_changes_are_combined_by_name() -> None:

@@ -101,12 +101,6 @@ def test_table_angles_in_the_names_run_the_other_way(rig: Rig) -> None:
     assert all(apart(azimuth_deg, -nearest_angle("obj1", image, 45)) < 1 for azimuth_deg, image in stored_views("obj1"))
 
 
-def test_camera_that_moves_around_the_object_shows_the_same_photographs(rig: Rig) -> None:
-    save(Path("photographs"))
-    assert rig("enroll", "obj1", "--yes", "--set", "table.carries=camera").exit_code == 0
-    assert all(apart(azimuth_deg, nearest_angle("obj1", image, 45)) < 1 for azimuth_deg, image in stored_views("obj1"))
-
-
 def test_fault_replaces_the_object_by_another_one_of_the_photographs(rig: Rig) -> None:
     save(Path("photographs"))
     rig("enroll", "obj1", "--yes", *WITHOUT_NOISE, *put(faults='["object_moved:other=3:angle=0@move3"]'))
@@ -154,14 +148,6 @@ def test_watch_shows_one_object_after_the_other(rig: Rig) -> None:
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert [event["name"] for event in events if event.get("event") == "identified"] == ["obj2", "obj1"]
     assert "has no object 'nothing'" in done.stderr
-
-
-def test_noise_of_the_simulated_camera_is_in_the_photographs(rig: Rig) -> None:
-    save(Path("photographs"))
-    noise = [*WITHOUT_NOISE, *put(**{"noise.gaussian_variance": 0.012})]
-    assert rig("enroll", "obj10", "--yes", *noise, "--set", "view.max_noise=1").exit_code == 0
-    ground = np.concatenate([image[:10].reshape(-1, 3) for _, image in stored_views("obj10")])
-    assert ground.std(axis=0)[0] == pytest.approx(255 * 0.012**0.5, rel=0.05)  # of the channel that is not clipped
 
 
 def test_empty_table_is_shown_from_its_image(rig: Rig) -> None:
@@ -303,12 +289,6 @@ def test_region_that_is_set_must_lie_within_the_photographs(rig: Rig) -> None:
     done = rig("enroll", "obj2", "--yes", "--set", "view.roi=[10, 10, 100, 80]")
     assert done.exit_code == 3
     assert "not within the camera's frame of 100x100" in done.stderr
-
-
-def test_calibration_boards_are_not_on_this_bench(rig: Rig) -> None:
-    save(Path("photographs"))
-    done = rig("calibrate", "camera")
-    assert "has no object" in done.stderr
 
 
 @given(st.lists(st.floats(0, 359.9), min_size=1, max_size=20, unique=True), st.floats(-1000, 1000))

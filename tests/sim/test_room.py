@@ -29,23 +29,6 @@ def test_most_of_the_background_changes_over_90_degrees_only_for_an_orbiting_cam
     assert changed_share(orbits=False, object_name="mug-star") < 0.1
 
 
-def test_room_depends_on_the_seed_only_and_closes_after_a_revolution() -> None:
-    np.testing.assert_array_equal(room(3, 20.0), room(3, 380.0))
-    assert (room(3, 20.0) != room(4, 20.0)).mean() > 0.5
-
-
-def shift_px(rows: slice) -> float:
-    """Return by how much these rows move to the right when the room rotates by 1°."""
-    before, after = (room(0, angle)[rows, 100:540].astype(float) for angle in (0.0, 1.0))
-    shifts = range(-20, 21)
-    return min(shifts, key=lambda by: np.abs(np.roll(before, by, axis=1) - after)[:, 20:-20].mean())
-
-
-def test_wall_behind_the_axis_moves_against_the_front_of_the_object() -> None:
-    """A counter-clockwise rotation moves the front of an object to the right, and the wall behind to the left."""
-    assert shift_px(slice(0, 100)) == pytest.approx(-450 * np.radians(1.0) * 2, abs=1.0)
-
-
 def test_platter_under_the_object_stands() -> None:
     empty = empty_platter()
     on_platter = (empty != empty[0, 0]).any(axis=2)

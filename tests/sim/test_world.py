@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.motion import rest, to_position, to_velocity
+from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
 from sim.world import HISTORY_S, Scene, World
 from tests.fuzzing import examples
@@ -133,17 +133,6 @@ class Mug:
     name = "mug"
 
 
-def test_object_is_put_on_the_platters_mark() -> None:
-    world = World(noise=perfect)
-    world.drive(rest(0.0, 40.0))
-    world.put(Mug(), yaw_deg=100.0, offset_mm=(1.0, -2.0))
-    assert world.scene.yaw_deg == 100.0  # at any table angle
-    assert world.scene.offset_mm == (1.0, -2.0)
-    assert world.scene.object is not None
-    world.put(None)
-    assert world.scene.object is None
-
-
 def test_past_scenes_do_not_change() -> None:
     world = World(noise=perfect)
     dark = (0.1, 0.1, 0.1)
@@ -161,12 +150,3 @@ def test_past_scenes_do_not_change() -> None:
 
 
 # -- randomness ----------------------------------------------------------------------------------------------------
-
-
-def test_random_streams_depend_on_seed_and_name() -> None:
-    def draws(seed: int, name: str) -> list[float]:
-        return World(seed=seed).rng(name).standard_normal(4).tolist()
-
-    assert draws(1, "imu") == draws(1, "imu")
-    assert draws(1, "imu") != draws(2, "imu")
-    assert draws(1, "imu") != draws(1, "servo-1")

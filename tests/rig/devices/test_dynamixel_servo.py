@@ -4,9 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
-from rig.core.next_steps import Do
-from rig.devices.dynamixel.registers import control_table, model_numbers
+from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.servo import MotionProfile
 from sim.noise import NoiseModel
@@ -28,14 +26,6 @@ def test_factory_settings_are_rejected_with_a_list_of_differences_and_not_change
     assert reported == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
     assert all(text.partition(": ")[2] for text in caught.value.evidence.values())  # each with its reason
     assert "write_settings" in caught.value.next_step
-
-
-def test_wrong_model_is_named():
-    wires = servo_wires(model="xm430_w350")
-    with pytest.raises(DeviceMismatch) as caught:
-        DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
-    assert caught.value.evidence["got"] == "xm430_w350"
-    assert Do.SET_KEY(key="servo.model", value="xm430_w350") in caught.value.steps
 
 
 def test_missing_servo_raises_device_not_found(wires):
@@ -101,35 +91,3 @@ def test_tripped_watchdog_is_cleared_only_by_torque_on(wires, servo):
     assert abs(wires.world.shaft()[1]) < 1e-9
     servo.torque_on()
     assert wires.device.memory["Bus Watchdog"] == 0
-
-
-def test_unknown_model_raises_config_error():
-    assert model_numbers()[1060] == "xl430_w250"
-    assert control_table("xl430_w250")["Present Position"].address == 132
-    assert control_table("xl330_m288", 52)["Indirect Data 1"].address == 208
-    with pytest.raises(ConfigError) as caught:
-        control_table("xl999")
-    assert "xl430_w250" in caught.value.evidence["models"]
-
-
-@pytest.mark.parametrize("name", ["Goal Position", "Present Load", "Homing Offset", "Torque Enable"])
-def test_registers_round_trip(name):
-    register = control_table("xl430_w250")[name]
-    low = -(2 ** (8 * register.size - 1)) if register.signed else 0
-    high = low + 2 ** (8 * register.size) - 1
-    for value in (low, -1 if register.signed else 1, 0, high):
-        assert register.decode(register.encode(value)) == value
-    with pytest.raises(OverflowError):
-        register.encode(high + 1)
-
-
-def test_drive_mode_with_torque_by_goal_is_corrected(wires):
-    """After a dip of the supply such a servo would go to the next goal at full speed, perhaps a revolution away."""
-    wires.device.memory["Drive Mode"] = 0b1000
-    servo = open_servo(wires)
-    assert wires.device.memory["Drive Mode"] == 0
-    wires.device.power_cycle()
-    wires.world.clock.sleep(0.5)
-    servo.move_to(servo.read_state().position_deg + 90)
-    wires.world.clock.sleep(1.0)
-    assert abs(wires.world.shaft()[0]) < 0.1

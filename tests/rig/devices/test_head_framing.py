@@ -39,16 +39,6 @@ def test_flipped_bit_is_always_detected(frame, data):
     assert found.crc_errors + found.malformed >= 1
 
 
-@fuzz_settings()
-@given(st.binary(max_size=3 * LONGEST))
-def test_random_bytes_raise_only_frame_errors(line):
-    try:
-        frame = decode(line)
-    except FrameError:
-        return
-    assert encode(frame) == line + b"\0"
-
-
 @fuzz_settings(0.4)
 @given(st.lists(FRAMES | st.binary(min_size=1, max_size=60), max_size=12), st.data())
 def test_frames_are_found_however_the_stream_is_split(parts, data):

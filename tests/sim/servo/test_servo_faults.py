@@ -127,14 +127,6 @@ def test_supply_is_compared_with_its_limits(line: Line, supply_v: float, alert: 
     assert (line.sdk.ping(line.port, 1)[2] == ALERT) is alert  # once raised, it stays
 
 
-def test_xl330_shuts_down_on_its_supply() -> None:
-    line = Line()
-    servo = line.add(1, "xl330_m288")
-    line.put(Torque_Enable=1)
-    servo.set_voltage(3.0)
-    assert line.read("Torque Enable") == 0
-
-
 def test_temperature_is_compared_with_its_limit(line: Line) -> None:
     line.put(Torque_Enable=1)
     line.servos[1].set_temperature(72.0)
@@ -142,21 +134,6 @@ def test_temperature_is_compared_with_its_limit(line: Line) -> None:
     line.servos[1].set_temperature(72.1)
     assert line.read("Hardware Error Status") == OVERHEATING_ERROR
     assert line.read("Present Temperature") == 72
-
-
-def test_lowered_limit_applies_at_once(line: Line) -> None:
-    assert line.write("Temperature Limit", 30) == ALERT
-    assert line.read("Hardware Error Status") == OVERHEATING_ERROR
-
-
-def test_case_cools_down_without_load(line: Line) -> None:
-    line.servos[1].set_temperature(70.0)
-    readings = []
-    for _ in range(5):
-        readings.append(line.read("Present Temperature"))
-        line.sleep(400.0)
-    assert readings == sorted(readings, reverse=True)
-    assert readings[1] == pytest.approx(33 + 37 / 2.718, abs=1)
 
 
 # -- a jammed table -------------------------------------------------------------------------------------------------

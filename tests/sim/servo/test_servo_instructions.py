@@ -7,10 +7,9 @@ from dynamixel_sdk import (
 )
 
 from sim.servo import Sender
-from sim.servo.device import BOOT_S
 from sim.servo.models import MODELS
 from sim.servo.protocol2 import StatusError, with_crc
-from tests.sim.servo.servo_bench import Line, extended
+from tests.sim.servo.servo_bench import Line
 
 
 def word(value: int) -> list[int]:
@@ -74,13 +73,6 @@ def test_two_servos_with_one_id_collide(line: Line) -> None:
     assert line.sent(Sender.DEVICE)[-1] != alone
 
 
-def test_registers_of_every_size_are_written_and_read(line: Line) -> None:
-    line.put(LED=1, Position_P_Gain=1234, Profile_Velocity=23_456)
-    assert [line.read(n) for n in ("LED", "Position P Gain", "Profile Velocity")] == [1, 1234, 23_456]
-    line.put(Homing_Offset=-1_044_479)
-    assert line.read("Homing Offset") == -1_044_479
-
-
 @pytest.mark.parametrize(
     ("address", "data", "error"),
     [
@@ -104,14 +96,6 @@ def test_invalid_writes_return_the_error_of_the_emanual(line: Line, address: int
     before = bytes(line.servos[1].memory.read(0, 635))
     assert line.sdk.writeTxRx(line.port, 1, address, len(data), data) == (COMM_SUCCESS, error)
     assert line.servos[1].memory.read(0, 635) == before
-
-
-def test_block_is_written_completely_or_not_at_all(line: Line) -> None:
-    block = double(7) + double(8) + double(4096)  # profile acceleration, profile velocity, goal beyond its limit
-    assert line.sdk.writeTxRx(line.port, 1, 108, 12, block) == (COMM_SUCCESS, StatusError.DATA_LIMIT)
-    assert (line.read("Profile Acceleration"), line.read("Profile Velocity")) == (0, 0)
-    assert line.sdk.writeTxRx(line.port, 1, 108, 12, double(7) + double(8) + double(100)) == (COMM_SUCCESS, 0)
-    assert [line.read(f"{n}") for n in ("Profile Acceleration", "Profile Velocity", "Goal Position")] == [7, 8, 100]
 
 
 def test_reads_beyond_the_table_and_unknown_instructions_are_rejected(line: Line) -> None:
@@ -152,25 +136,3 @@ def test_new_id_and_baud_rate_are_used_from_the_next_instruction(line: Line) -> 
     assert line.sdk.ping(line.port, 9)[1] == COMM_RX_TIMEOUT
     line.serial.baudrate = 115_200
     assert line.sdk.ping(line.port, 9)[1] == COMM_SUCCESS
-
-
-def test_reboot_is_answered_and_resets_all_but_the_eeprom(line: Line) -> None:
-    extended(line)
-    line.put(LED=1)
-    assert line.sdk.reboot(line.port, 1) == (COMM_SUCCESS, 0)
-    started_ns = line.clock.now_ns()
-    assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
-    line.clock.advance_to(started_ns + round(BOOT_S * 1e9))
-    assert [line.read(n) for n in ("Torque Enable", "LED", "Profile Velocity", "Operating Mode")] == [0, 0, 0, 4]
-    assert line.read("Realtime Tick") < 10
-
-
-def test_reboot_loses_the_revolutions(line: Line) -> None:
-    extended(line, velocity=200)
-    line.put(Goal_Position=2048 + 3 * 4096 + 100)
-    line.sleep(8.0)
-    assert line.read("Present Position") == 2048 + 3 * 4096 + 100
-    line.sdk.reboot(line.port, 1)
-    line.sleep(0.5)
-    assert line.read("Present Position") == 2148
-    assert line.shaft() == pytest.approx(3 * 360 + 100 * 360 / 4096)

@@ -57,27 +57,6 @@ def test_profile_velocity_0_means_maximum_speed(line: Line) -> None:
     assert line.read("Moving Status") & 0x30 == 0
 
 
-@pytest.mark.parametrize(
-    ("velocity", "acceleration", "counts", "profile"),
-    [(44, 0, 1024, RECTANGULAR), (44, 10, 1024, TRAPEZOIDAL), (200, 10, 500, TRIANGULAR)],
-)
-def test_moving_status_names_the_profile(
-    line: Line, velocity: int, acceleration: int, counts: int, profile: int
-) -> None:
-    extended(line, velocity, acceleration)
-    line.put(Goal_Position=2048 + counts)
-    line.sleep(0.1)
-    assert line.read("Moving Status") == profile | ONGOING
-    assert line.read("Moving") == 1
-
-
-def test_time_based_profile_takes_the_time_it_is_given(line: Line) -> None:
-    line.put(Drive_Mode=4, Operating_Mode=4, Profile_Velocity=2000, Profile_Acceleration=500, Torque_Enable=1)
-    line.put(Goal_Position=2048 + 1024)
-    assert arrival_s(line) == pytest.approx(2.0, abs=1e-6)
-    assert max(line.servos[1].motor.commanded.velocity_dps) == pytest.approx(90 / 1.5, rel=1e-6)
-
-
 def test_velocity_limit_and_supply_bound_the_speed(line: Line) -> None:
     line.put(Operating_Mode=4, Velocity_Limit=100, Torque_Enable=1, Goal_Position=100_000)
     line.sleep(1.0)
@@ -204,18 +183,6 @@ def test_reverse_mode_inverts_every_sign(line: Line) -> None:
     assert line.shaft() == pytest.approx(-90)
 
 
-@pytest.mark.parametrize(
-    ("mode", "offset", "present"), [(3, 1000, 3048), (3, 1025, 2048), (4, 1025, 3073), (4, -9000, -6952)]
-)
-def test_homing_offset_shifts_the_position(line: Line, mode: int, offset: int, present: int) -> None:
-    line.put(Operating_Mode=mode, Homing_Offset=offset)
-    assert line.read("Present Position") == present
-    if mode == 4:
-        line.put(Profile_Velocity=100, Profile_Acceleration=50, Torque_Enable=1, Goal_Position=present + 512)
-        line.sleep(3.0)
-        assert line.shaft() == pytest.approx(45)
-
-
 def test_encoder_noise_depends_on_noise_model_and_seed() -> None:
     def readings(sigma: float) -> list[int]:
         line = Line(noise=NoiseModel.none().with_values(encoder_noise_deg=sigma))
@@ -242,13 +209,6 @@ def test_goal_written_while_torque_is_off_is_ignored(line: Line) -> None:
     assert line.read("Goal Position") == 2048
 
 
-def test_goal_enables_torque_in_the_drive_mode_torque_by_goal(line: Line) -> None:
-    line.put(Drive_Mode=8, Goal_Position=3000)
-    assert line.read("Torque Enable") == 1
-    line.sleep(2.0)
-    assert line.read("Present Position") == 3000
-
-
 def test_torque_holds_the_shaft_and_torque_off_releases_it(line: Line) -> None:
     extended(line, velocity=100)
     with pytest.raises(ValueError, match="torque"):
@@ -262,13 +222,3 @@ def test_torque_holds_the_shaft_and_torque_off_releases_it(line: Line) -> None:
     line.sleep(2.0)
     assert line.shaft() == stopped < 360.0
     assert line.read("Moving Status") == 0
-
-
-def test_goals_of_another_mode_move_nothing(line: Line) -> None:
-    extended(line)
-    line.put(Goal_Velocity=50)
-    line.sleep(1.0)
-    line.put(Torque_Enable=0, Operating_Mode=1)
-    line.put(Torque_Enable=1, Goal_Position=9000)
-    line.sleep(1.0)
-    assert line.shaft() == 0.0
