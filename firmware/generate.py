@@ -18,7 +18,7 @@ BEGIN, END = "<!-- generated from protocol.toml -->", "<!-- end of generated par
 
 Table = dict[str, Any]
 
-FIRMWARE_ONLY = {"tick_us", "estop_ticks", "deadman_default_ms", "trigger_min_us", "trigger_max_us", "capability"}
+FIRMWARE_ONLY = {"tick_us", "estop_ticks", "deadman_default_ms", "capability"}
 
 
 def size(message: Table) -> int:

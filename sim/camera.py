@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable
-from copy import copy
 from dataclasses import replace
 from functools import lru_cache, partial
 from math import ceil, cos, radians, sin
@@ -230,14 +229,6 @@ class SimCapture:
         for tamper in self.filters:
             image = tamper(image, self._grabbed)
         return True, image
-
-    def retrieval(self) -> Callable[[], tuple[bool, Image | None]]:
-        """Return a function that returns, at any time and in any thread, the frame that `retrieve` would return now."""
-        if self._grabbed is not None and self._delivers:
-            self._world.notify(Activity.FRAME_FETCHED)
-        still = copy(self)
-        still._world, still._controls = self._world.frozen(), self._controls[:]
-        return still.retrieve
 
     def get(self, prop: int) -> float:
         self._meter()

@@ -5,7 +5,6 @@ Drivers reach the emulated devices through their buses. Tests set and read this 
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from copy import copy
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
@@ -81,13 +80,6 @@ class World:
     def rng(self, name: str) -> np.random.Generator:
         """Return a fresh generator for the stream ``name`` of this world's seed."""
         return np.random.default_rng([self.seed, crc32(name.encode())])
-
-    def frozen(self) -> "World":
-        """Return a copy that does not change, for another thread. It has no listeners."""
-        still = copy(self)
-        still.listeners = []
-        still._scenes, still._motions, still._slips = self._scenes[:], self._motions[:], self._slips[:]
-        return still
 
     # -- the table ------------------------------------------------------------------------------------------------
 

@@ -47,7 +47,6 @@ static void latch(struct head *head, uint8_t fault) {
 static void outputs_off(struct head *head) {
     hal_relay(false);
     hal_light(0);
-    hal_trigger_off();
     head->light = 0;
     head->inputs &= (uint8_t)~INPUT_RELAY_CLOSED;
 }
@@ -197,29 +196,12 @@ static uint8_t put_own_identity(struct head *head, uint8_t *body) {
         .minor = FIRMWARE_MINOR,
         .patch = FIRMWARE_PATCH,
         .board = hal_board(),
-        .capabilities = CAPABILITY_IMU | CAPABILITY_LIGHT | CAPABILITY_TRIGGER | CAPABILITY_ESTOP | CAPABILITY_RELAY,
+        .capabilities = CAPABILITY_IMU | CAPABILITY_LIGHT | CAPABILITY_ESTOP | CAPABILITY_RELAY,
         .reset_cause = head->reset_cause,
         .serial = hal_serial(),
         .uptime_us = hal_micros(),
     };
     return put_identity(body, &m);
-}
-
-static uint8_t trigger(struct head *head, uint16_t width_us, uint8_t *body) {
-    struct triggered m = {.width_us = width_us};
-    uint8_t rejection = REJECTION_NONE;
-    if (width_us < TRIGGER_MIN_US || width_us > TRIGGER_MAX_US) {
-        return REJECTION_OUT_OF_RANGE;
-    }
-    uint8_t before = hal_lock();
-    if (head->state == HEAD_STATE_FAULT) {
-        rejection = REJECTION_FAULT_LATCHED;
-    } else if (!hal_trigger(width_us, &m.time_us)) {
-        rejection = REJECTION_BUSY;
-    }
-    hal_unlock(before);
-    put_triggered(body, &m);
-    return rejection;
 }
 
 /* Rejected while the head is active: storing takes some milliseconds, in which no sample is sent. */
@@ -235,7 +217,7 @@ static uint8_t set_serial(struct head *head, uint32_t serial) {
 static uint8_t length_of(uint8_t id) {
     static const uint8_t sizes[] = {
         [MESSAGE_HELLO] = SIZE_HELLO, [MESSAGE_HEARTBEAT] = SIZE_HEARTBEAT,   [MESSAGE_SHUTDOWN] = SIZE_SHUTDOWN,
-        [MESSAGE_LIGHT] = SIZE_LIGHT, [MESSAGE_RELAY] = SIZE_RELAY, [MESSAGE_TRIGGER] = SIZE_TRIGGER,
+        [MESSAGE_LIGHT] = SIZE_LIGHT, [MESSAGE_RELAY] = SIZE_RELAY,
         [MESSAGE_SET_IMU] = SIZE_SET_IMU, [MESSAGE_READ_COUNTERS] = SIZE_READ_COUNTERS,
         [MESSAGE_ACKNOWLEDGE] = SIZE_ACKNOWLEDGE, [MESSAGE_STREAM] = SIZE_STREAM, [MESSAGE_SET_SERIAL] = SIZE_SET_SERIAL,
     };
@@ -273,11 +255,6 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
             break;
         case MESSAGE_RELAY:
             rejection = set_relay(head, body[RELAY_CLOSED]);
-            break;
-        case MESSAGE_TRIGGER:
-            rejection = trigger(head, get_u16(body + TRIGGER_WIDTH_US), out);
-            *reply = MESSAGE_TRIGGERED;
-            answer = SIZE_TRIGGERED;
             break;
         case MESSAGE_SET_IMU:
             rejection = imu_setup(&head->imu, body[SET_IMU_MODEL], body[SET_IMU_ADDRESS], body[SET_IMU_DIVIDER],

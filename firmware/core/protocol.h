@@ -18,8 +18,6 @@
 #define DEADMAN_MIN_MS 50 /* shortest deadman */
 #define DEADMAN_DEFAULT_MS 250 /* deadman before the first heartbeat sets it */
 #define DEADMAN_MAX_MS 2000 /* longest deadman */
-#define TRIGGER_MIN_US 10 /* shortest trigger pulse */
-#define TRIGGER_MAX_US 30000 /* longest trigger pulse */
 #define SERIAL_UNSET 4294967295UL /* serial number of a board without one */
 
 /* Board of the firmware. */
@@ -29,7 +27,6 @@
 /* Bits of `identity.capabilities`. */
 #define CAPABILITY_IMU 1
 #define CAPABILITY_LIGHT 2
-#define CAPABILITY_TRIGGER 4
 #define CAPABILITY_ESTOP 8
 #define CAPABILITY_RELAY 16
 
@@ -96,8 +93,6 @@
 #define SIZE_LIGHT 1
 #define MESSAGE_RELAY 0x06
 #define SIZE_RELAY 1
-#define MESSAGE_TRIGGER 0x07
-#define SIZE_TRIGGER 2
 #define MESSAGE_SET_IMU 0x08
 #define SIZE_SET_IMU 5
 #define MESSAGE_STREAM 0x09
@@ -112,8 +107,6 @@
 #define SIZE_IDENTITY 15
 #define MESSAGE_HEARTBEAT_REPLY 0x82
 #define SIZE_HEARTBEAT_REPLY 14
-#define MESSAGE_TRIGGERED 0x87
-#define SIZE_TRIGGERED 6
 #define MESSAGE_COUNTERS 0x8A
 #define SIZE_COUNTERS 20
 #define MESSAGE_SAMPLE 0xC0
@@ -205,17 +198,6 @@ static inline uint8_t put_heartbeat_reply(uint8_t *out, const struct heartbeat_r
     return SIZE_HEARTBEAT_REPLY;
 }
 
-struct triggered {
-    uint32_t time_us;
-    uint16_t width_us;
-};
-
-static inline uint8_t put_triggered(uint8_t *out, const struct triggered *m) {
-    out = put_u32(out, m->time_us);
-    out = put_u16(out, m->width_us);
-    return SIZE_TRIGGERED;
-}
-
 struct counters {
     uint16_t frames;
     uint16_t crc_errors;
@@ -302,7 +284,6 @@ static inline uint8_t put_status_changed(uint8_t *out, const struct status_chang
 #define ACKNOWLEDGE_FAULTS 0
 #define LIGHT_LEVEL 0
 #define RELAY_CLOSED 0
-#define TRIGGER_WIDTH_US 0
 #define SET_IMU_MODEL 0
 #define SET_IMU_ADDRESS 1
 #define SET_IMU_DIVIDER 2

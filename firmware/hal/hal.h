@@ -54,10 +54,6 @@ uint16_t hal_imu_edges(uint32_t *last_us);
 void hal_light(uint8_t level);
 void hal_relay(bool closed);
 
-/* Start one pulse of `width_us`; returns false during another pulse. `*begins_us` is its leading edge. */
-bool hal_trigger(uint16_t width_us, uint32_t *begins_us);
-void hal_trigger_off(void);
-
 /* Return whether the e-stop loop is open: pressed, unplugged or broken. */
 bool hal_estop_open(void);
 

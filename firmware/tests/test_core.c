@@ -78,7 +78,7 @@ static uint64_t never(uint64_t ns) {
 static struct board *board;
 static uint64_t now_ns;
 static uint8_t sequence;
-static int relay, light, trigger;
+static int relay, light;
 static uint64_t relay_ns, light_ns;
 static uint8_t answer[FRAME_ENCODED], event[FRAME_ENCODED];
 
@@ -98,9 +98,6 @@ static void run_ms(uint64_t ms) {
             case BOARD_RELAY:
                 relay = outputs[i].value;
                 relay_ns = outputs[i].ns;
-                break;
-            case BOARD_TRIGGER:
-                trigger = outputs[i].value;
                 break;
             case BOARD_BYTE:
                 if (outputs[i].value) {
@@ -149,7 +146,7 @@ static uint8_t ask_u8(uint8_t id, uint8_t value) {
 
 static void power_up_with(int32_t (*device)(uint64_t, int32_t, uint8_t *, int32_t)) {
     now_ns = 0;
-    relay = light = trigger = 0;
+    relay = light = 0;
     board = board_open((struct board_outside){device, never}, NULL, 0, 7);
     run_ms(5);
     CHECK(event[0] == MESSAGE_STATUS_CHANGED && event[FRAME_HEADER + 9] == RESET_POWER_ON);
@@ -220,13 +217,14 @@ static void test_estop_acts_within_a_millisecond(void) {
 static void test_a_repeated_request_is_answered_but_not_done_twice(void) {
     power_up();
     beat(2000);
-    uint8_t width[SIZE_TRIGGER] = {100, 0};
-    send(MESSAGE_TRIGGER, width, sizeof width, 77);
-    CHECK(answer[0] == MESSAGE_TRIGGERED && trigger == 0);
+    uint8_t level = 9;
+    send(MESSAGE_LIGHT, &level, 1, 77);
+    CHECK(answer[0] == MESSAGE_DONE && light == 9);
     uint8_t first[FRAME_ENCODED];
     memcpy(first, answer, sizeof first);
-    send(MESSAGE_TRIGGER, width, sizeof width, 77);
-    CHECK(!memcmp(first, answer, FRAME_HEADER + SIZE_TRIGGERED));
+    level = 5; /* the number tells the repetition */
+    send(MESSAGE_LIGHT, &level, 1, 77);
+    CHECK(!memcmp(first, answer, FRAME_HEADER + SIZE_DONE) && light == 9);
     board_close(board);
 }
 

@@ -31,7 +31,7 @@ _NEVER = 2**64 - 1  # later than every time of the board
 _ROOM = 1024  # changes of outputs that are taken at once; more remain on the board for the next call
 
 _START_WRITE, _START_READ, _WRITE, _READ, _STOP = range(5)
-_BYTE, _LIGHT, _RELAY, _TRIGGER, _RESET = range(5)
+_BYTE, _LIGHT, _RELAY, _RESET = range(4)
 _OUTPUT = np.dtype([("ns", np.uint64), ("event", np.int32), ("value", np.int32)])
 
 _I2c = CFUNCTYPE(c_int32, c_uint64, c_int32, POINTER(c_uint8), c_int32)
@@ -44,7 +44,7 @@ class _Environment(Structure):
 
 @dataclass(frozen=True, slots=True)
 class PinChange:
-    """A change of an output: ``pin`` is light (duty, 0 to 1), relay or trigger (0 or 1)."""
+    """A change of an output: ``pin`` is light (duty, 0 to 1) or relay (0 or 1)."""
 
     time_ns: int
     pin: str
@@ -118,7 +118,6 @@ class SimHead:
         self.world_at_board_time = cast(World, _WorldAtBoardTime(self, world))
         self.light = 0.0
         self.relay_closed = False
-        self.trigger_on = False
         self.changes: deque[PinChange] = deque(maxlen=10_000)
         self.filters: list[Callable[[bool, int], int | None]] = []
         self.listeners: list[Callable[[PinChange], None]] = []
@@ -329,12 +328,9 @@ class SimHead:
         elif event == _LIGHT:
             self.light = value / 255
             self._changed(PinChange(time_ns, "light", self.light))
-        elif event == _RELAY:
+        else:
             self.relay_closed = bool(value)
             self._changed(PinChange(time_ns, "relay", value))
-        else:
-            self.trigger_on = bool(value)
-            self._changed(PinChange(time_ns, "trigger", value))
 
     def _changed(self, change: PinChange) -> None:
         self.changes.append(change)

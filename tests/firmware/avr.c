@@ -27,7 +27,7 @@
 #define FOREVER UINT8_MAX
 
 enum { MCUSR = 0x54, TWCR = 0xBC, TCCR2A = 0xB0, OCR2B = 0xB4, PORTD = 0x2B, PORF = 1, EXTRF = 2, BORF = 4, WDRF = 8 };
-enum { D_READY = 2, D_LIGHT = 3, D_RELAY = 4, D_ESTOP = 5, B_TRIGGER = 1, C_SDA = 4, C_SCL = 5 };
+enum { D_READY = 2, D_LIGHT = 3, D_RELAY = 4, D_ESTOP = 5, C_SDA = 4, C_SCL = 5 };
 enum { OP_RJMP_SELF = 0xCFFF };
 
 struct arriving {
@@ -53,7 +53,7 @@ struct board {
     avr_irq_t *uart_in, *ready, *estop, *sda, *twi_in;
     bool estop_open, scl;
     uint8_t stuck;
-    int32_t light, relay, trigger;
+    int32_t light, relay;
 
     /* I2C: the emulator's function for writes to TWCR, which must not be called while the bus is stuck. */
     avr_io_write_t write_twcr;
@@ -102,12 +102,6 @@ static void on_relay(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     struct board *b = param;
     set(b, &b->relay, BOARD_RELAY, value & 1);
-}
-
-static void on_trigger(struct avr_irq_t *irq, uint32_t value, void *param) {
-    (void)irq;
-    struct board *b = param;
-    set(b, &b->trigger, BOARD_TRIGGER, value & 1);
 }
 
 /* The light's duty: the compare value while the timer drives the pin, else the port's level. */
@@ -232,7 +226,6 @@ static void wire_up(struct board *b) {
     b->edge_falls = BOARD_NEVER;
     set(b, &b->light, BOARD_LIGHT, 0); /* pins are inputs again; external resistors pull them to their inactive levels */
     set(b, &b->relay, BOARD_RELAY, 0);
-    set(b, &b->trigger, BOARD_TRIGGER, 0);
     schedule_edge(b);
 }
 
@@ -278,7 +271,6 @@ struct board *board_open(struct board_outside outside, const uint8_t *image, uin
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_TWI_GETIRQ(0), TWI_IRQ_OUTPUT), on_twi, b);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('D'), D_RELAY), on_relay, b);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('D'), D_LIGHT), on_light_port, b);
-    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('B'), B_TRIGGER), on_trigger, b);
     avr_irq_register_notify(scl, on_scl, b);
     avr_register_io_write(avr, TCCR2A, on_light_register, b);
     avr_register_io_write(avr, OCR2B, on_light_register, b);

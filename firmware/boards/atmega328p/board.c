@@ -1,6 +1,6 @@
 /* ATmega328P at 16 MHz: Arduino Nano or Uno. Pins: see firmware/README.md.
  *
- * Timer 0: the safety tick. Timer 1: time, and the trigger's pulse. Timer 2: the light's PWM at 7.8 kHz. */
+ * Timer 0: the safety tick. Timer 1: time. Timer 2: the light's PWM at 7.8 kHz. */
 #include <avr/eeprom.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
@@ -15,13 +15,11 @@
 #define LIGHT PD3     /* OC2B */
 #define RELAY PD4
 #define ESTOP PD5
-#define TRIGGER PB1 /* OC1A */
 #define SDA PC4
 #define SCL PC5
 
 #define TICKS_PER_US 2U /* of timer 1 */
 #define BYTE_US (10U * 1000000UL / BAUD)
-#define TRIGGER_DELAY_US 20U
 
 static struct head head;
 static volatile bool woken; /* an interrupt has work for the main loop */
@@ -297,42 +295,6 @@ void hal_relay(bool closed) {
     }
 }
 
-/* The timer sets the pin at the first match and clears it at the second. Call it with interrupts off. */
-static uint16_t trigger_ticks;
-
-bool hal_trigger(uint16_t width_us, uint32_t *begins_us) {
-    if (TIMSK1 & _BV(OCIE1A)) {
-        return false;
-    }
-    trigger_ticks = width_us * TICKS_PER_US;
-    OCR1A = (uint16_t)(TCNT1 + TRIGGER_DELAY_US * TICKS_PER_US);
-    *begins_us = micros_locked() + TRIGGER_DELAY_US;
-    TCCR1A = _BV(COM1A1) | _BV(COM1A0);
-    TIFR1 = _BV(OCF1A);
-    TIMSK1 |= _BV(OCIE1A);
-    return true;
-}
-
-void hal_trigger_off(void) {
-    TCCR1A = 0;
-    PORTB &= (uint8_t)~_BV(TRIGGER);
-    TIMSK1 &= (uint8_t)~_BV(OCIE1A);
-}
-
-ISR(TIMER1_COMPA_vect) {
-    if (!trigger_ticks) {
-        hal_trigger_off();
-        return;
-    }
-    TCCR1A = _BV(COM1A1);
-    OCR1A += trigger_ticks;
-    /* If this is too late for a short pulse, end it here; otherwise it lasts until the timer wraps around. */
-    if (OCR1A - TCNT1 > trigger_ticks) {
-        hal_trigger_off();
-    }
-    trigger_ticks = 0;
-}
-
 bool hal_estop_open(void) {
     return PIND & _BV(ESTOP);
 }
@@ -367,7 +329,6 @@ void hal_store_serial(uint32_t serial) {
 int main(void) {
     PORTD = _BV(ESTOP); /* pull-up: an open loop reads high */
     DDRD = _BV(LIGHT) | _BV(RELAY);
-    DDRB = _BV(TRIGGER);
 
     TCCR0A = _BV(WGM01); /* clear on match, 16 MHz / 64 */
     OCR0A = F_CPU / 64 * TICK_US / 1000000UL - 1;

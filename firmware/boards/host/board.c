@@ -43,8 +43,6 @@ struct board {
 
     uint16_t edges;
     uint32_t edge_us;
-    uint64_t trigger_ends;
-    bool trigger_on;
     int32_t light, relay;
 };
 
@@ -187,28 +185,6 @@ void hal_relay(bool closed) {
     }
 }
 
-static void set_trigger(struct board *b, bool on) {
-    if (b->trigger_on != on) {
-        b->trigger_on = on;
-        emit(b, b->now, BOARD_TRIGGER, on);
-    }
-}
-
-bool hal_trigger(uint16_t width_us, uint32_t *begins_us) {
-    if (here->trigger_on) {
-        return false;
-    }
-    *begins_us = micros(here);
-    here->trigger_ends = here->now + width_us * 1000ULL;
-    set_trigger(here, true);
-    return true;
-}
-
-void hal_trigger_off(void) {
-    here->trigger_ends = BOARD_NEVER;
-    set_trigger(here, false);
-}
-
 bool hal_estop_open(void) {
     return here->estop_open;
 }
@@ -240,7 +216,6 @@ static void start(struct board *b, uint8_t cause) {
     b->sent_until = b->now;
     b->i2c_result = HAL_I2C_DONE;
     b->i2c_ends = BOARD_NEVER;
-    b->trigger_ends = BOARD_NEVER;
     b->next_edge = b->outside.edge(b->now);
     head_init(&b->head);
 }
@@ -269,7 +244,6 @@ void board_reset(struct board *b, uint8_t cause) {
     here = b;
     hal_light(0); /* pins become inputs, and external resistors pull them to their inactive levels */
     hal_relay(false);
-    hal_trigger_off();
     emit(b, b->now, BOARD_RESET, cause);
     start(b, cause);
 }
@@ -322,7 +296,7 @@ static uint64_t earliest(uint64_t a, uint64_t b) {
 void board_run(struct board *b, uint64_t until) {
     here = b;
     for (;;) {
-        uint64_t next = earliest(earliest(b->next_tick, b->next_edge), earliest(b->i2c_ends, b->trigger_ends));
+        uint64_t next = earliest(earliest(b->next_tick, b->next_edge), b->i2c_ends);
         if (b->arriving_count) {
             next = earliest(next, b->arriving[b->arriving_head].ns);
         }
@@ -330,9 +304,6 @@ void board_run(struct board *b, uint64_t until) {
             break;
         }
         b->now = next > b->now ? next : b->now;
-        if (b->trigger_ends <= b->now) {
-            hal_trigger_off();
-        }
         if (b->next_edge <= b->now) {
             b->edges++;
             b->edge_us = micros(b);

@@ -21,7 +21,7 @@ struct board_outside {
     uint64_t (*edge)(uint64_t ns);
 };
 
-enum board_event { BOARD_BYTE, BOARD_LIGHT, BOARD_RELAY, BOARD_TRIGGER, BOARD_RESET };
+enum board_event { BOARD_BYTE, BOARD_LIGHT, BOARD_RELAY, BOARD_RESET };
 
 /* An output of the board at `ns`: a byte whose stop bit ends then, a duty in 1/255, or a level. BOARD_RESET has the
  * cause; bytes that would have ended after it are lost. */

@@ -2,16 +2,14 @@
 
 import errno
 import os
-import select
 import termios
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
 import serial
 from dynamixel_sdk import PortHandler
-from serial.serialutil import Timeout
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceNotFound
@@ -63,7 +61,7 @@ def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None
     was_guarded = True  # a guardian may close the port between the attempt to open it and the check of its users
     while True:
         try:
-            connection: SerialConnection = _PolledSerial(
+            connection: SerialConnection = serial.Serial(
                 path, baud, timeout=READ_SLICE_S, write_timeout=1.0, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as error:
@@ -75,48 +73,6 @@ def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None
             clock.sleep(_BUSY_RETRY_S)
         else:
             return connection
-
-
-class _PolledSerial(serial.Serial):  # type: ignore[misc]
-    """A port that waits by `poll`; pyserial waits by `select`, which fails with a descriptor above 1,023."""
-
-    def read(self, size: int = 1) -> bytes:
-        limit, data = Timeout(self.timeout), bytearray()
-        while len(data) < size and self._wait(select.POLLIN, limit):
-            with self._errors():
-                part = os.read(self.fd, size - len(data))
-                if not part:
-                    raise OSError(errno.EIO, "the device is disconnected")
-                data += part
-        return bytes(data)
-
-    def write(self, data: bytes, /) -> int:
-        limit, rest = Timeout(self.write_timeout), data
-        while rest:
-            if not self._wait(select.POLLOUT, limit):
-                raise serial.SerialTimeoutException("Write timeout")
-            with self._errors():
-                rest = rest[os.write(self.fd, rest) :]
-        return len(data)
-
-    def _wait(self, event: int, limit: Timeout) -> bool:
-        """Wait until reading or writing does not block; return False at the time limit."""
-        if not self.is_open:
-            raise serial.PortNotOpenError
-        ready = select.poll()
-        ready.register(self.fd, event)
-        return bool(ready.poll(limit.time_left() * 1e3))
-
-    @staticmethod
-    @contextmanager
-    def _errors() -> Iterator[None]:
-        """Convert errors as pyserial does."""
-        try:
-            yield
-        except BlockingIOError:
-            pass  # another thread dropped the bytes meanwhile
-        except OSError as error:
-            raise serial.SerialException(*error.args) from error
 
 
 def _not_opened(path: str, baud: int, device: str, error: Exception, *, guarded: bool) -> DeviceNotFound:

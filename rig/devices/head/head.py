@@ -47,8 +47,6 @@ from rig.devices.head.protocol import (
     Shutdown,
     StatusChanged,
     Stream,
-    Trigger,
-    Triggered,
 )
 from rig.devices.head.samples import HeadClock, HeadSensor, SampleStream, head_sensor
 from rig.devices.imu import ImuIdentity, ImuSamples, another_sensor
@@ -311,13 +309,6 @@ class RigHead:
         if config.light is not None:
             self.set_light(config.light)
         return fault
-
-    def trigger(self, width_s: float = 0.001) -> int:
-        """Send one pulse to the camera; return when it begins, on the bench's clock (ns)."""
-        with self._in_use():
-            answer = self._link.request(Trigger(round(1e6 * width_s)), Triggered)
-            time_ns = self._timing.to_host(np.array([self._timing.unwrap(answer.time_us)]))
-            return int(time_ns[0])
 
     # -- status and faults ------------------------------------------------------------------------------------------
 

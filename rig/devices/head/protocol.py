@@ -156,13 +156,6 @@ class Relay(HeadMessage, number=0x06, layout="<B"):
 
 
 @dataclass(frozen=True, slots=True)
-class Trigger(HeadMessage, number=0x07, layout="<H"):
-    """Send one pulse to the camera."""
-
-    width_us: int  # Length of the pulse.
-
-
-@dataclass(frozen=True, slots=True)
 class SetImu(HeadMessage, number=0x08, layout="<BBBBB"):
     """Set up the sensor; `status_changed` and each `heartbeat_reply` report the result."""
 
@@ -230,14 +223,6 @@ class HeartbeatReply(HeadMessage, number=0x82, layout="<IIBBBBBB"):
 
 
 @dataclass(frozen=True, slots=True)
-class Triggered(HeadMessage, number=0x87, layout="<IH"):
-    """The pulse started."""
-
-    time_us: int  # Its leading edge.
-    width_us: int  # Its length.
-
-
-@dataclass(frozen=True, slots=True)
 class Counters(HeadMessage, number=0x8A, layout="<HHHHHHHHHH"):
     """Counters since the start; they stop at 65535."""
 
@@ -283,11 +268,9 @@ class StatusChanged(HeadMessage, number=0xC1, layout="<IBBBBBB"):
     reset_cause: int  # Reset.
 
 
-Request = (
-    Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger | SetImu | Stream | ReadCounters | SetSerial
-)
+Request = Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | SetImu | Stream | ReadCounters | SetSerial
 
-Answer = Done | Identity | HeartbeatReply | Triggered | Counters | Sample | StatusChanged
+Answer = Done | Identity | HeartbeatReply | Counters | Sample | StatusChanged
 
 MESSAGES: dict[int, type[Request] | type[Answer]] = {
     message.ID: message for message in (*get_args(Request), *get_args(Answer))
@@ -296,7 +279,6 @@ MESSAGES: dict[int, type[Request] | type[Answer]] = {
 REPLIES: dict[type[Request], type[Answer]] = {
     Hello: Identity,
     Heartbeat: HeartbeatReply,
-    Trigger: Triggered,
     ReadCounters: Counters,
 }
 """The reply to a request that is not rejected, if it is not `Done`."""

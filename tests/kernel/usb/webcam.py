@@ -5,6 +5,7 @@ class's definitions of the payload formats.
 """
 
 import struct
+from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
 from threading import Event, Thread
@@ -21,6 +22,7 @@ from sim.camera_controls import V4L2_EXPOSURE_APERTURE_PRIORITY, V4L2_EXPOSURE_M
 from sim.frame_times import FPS
 from sim.objects.projection import HEIGHT, WIDTH
 from sim.realtime.pace import RealTime
+from sim.world import Activity
 from tests.kernel.usb.descriptors import BULK, Identity, configuration, endpoint, interface
 from tests.kernel.usb.device import Request, UsbDevice
 from tests.kernel.usb.usbip import Stall
@@ -287,8 +289,8 @@ class Webcam(UsbDevice):
             with self._time.present():
                 stream = self._streams
                 wait_ns = 1 if self.stopped else self._camera.wait_ns()
-                draw = None if wait_ns or not self._camera.grab() else self._camera.retrieval()
-            image = None if draw is None else draw()[1]  # while the world continues
+                still = None if wait_ns or not self._camera.grab() else still_of(self._camera)
+            image = None if still is None else still.retrieve()[1]  # while the world continues
             if image is None:
                 clock.sleep(min(max(wait_ns * 1e-9, 0.001), LONGEST_WAIT_S))
                 continue
@@ -324,3 +326,13 @@ def encoded(image: NDArray[np.uint8], form: Format) -> bytes:
         return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
     # In YUYV levels reach from 16 to 235 (ITU-R BT.601), in JPEG from 0 to 255.
     return bytes(np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_YUYV)))
+
+
+def still_of(camera: SimCapture) -> SimCapture:
+    """Return a copy of a camera that shows the grabbed frame at any time, in any thread."""
+    camera._world.notify(Activity.FRAME_FETCHED)
+    still, world = copy(camera), copy(camera._world)
+    world.listeners = []
+    world._scenes, world._motions, world._slips = world._scenes[:], world._motions[:], world._slips[:]
+    still._world, still._controls = world, camera._controls[:]
+    return still

@@ -193,22 +193,6 @@ def test_light_and_power_follow_requests(opened):
     assert not opened.imu.status.faults  # no fault at rest
 
 
-@AVR_NIGHTLY
-def test_trigger_pulse_has_the_requested_width_and_time(opened):
-    opened.clock.sleep(1.0)
-    began_ns = opened.imu.trigger(0.002)
-    opened.clock.sleep(0.01)
-    (up_ns, up), (down_ns, down) = opened.head.pulses("trigger")
-    assert (up, down) == (1, 0)
-    assert began_ns == pytest.approx(up_ns, abs=2e3 * opened.imu.health()["time_uncertainty_us"])
-    assert down_ns - up_ns == pytest.approx(2 * MS, rel=0.003)  # the clock has an error of 0.2 %
-    with pytest.raises(RequestRejected, match="range"):
-        opened.imu.trigger(0.04)
-    opened.imu.trigger(0.03)
-    with pytest.raises(RequestRejected, match="still processes"):
-        opened.imu.trigger(0.001)
-
-
 # -- safety functions -----------------------------------------------------------------------------------------------
 
 

@@ -11,14 +11,18 @@ from rig.core.errors import (
     RequestRejected,
 )
 from rig.devices.head.head import RigHead
-from rig.devices.head.link import HeadLink
+from rig.devices.head.link import HeadFrame, HeadLink, encode
 from rig.devices.head.protocol import (
     BAUD,
+    PROTOCOL_VERSION,
+    Counters,
+    Done,
     HeadState,
+    Hello,
+    Identity,
     Light,
+    ReadCounters,
     SampleFlag,
-    Trigger,
-    Triggered,
 )
 from sim.clock import VirtualClock
 from sim.head.board import SimHead
@@ -84,21 +88,22 @@ def test_late_reply_answers_no_other_request():
         link.start()
         h.head.filters.append(lambda to_head, byte: None if not to_head else byte)
         with pytest.raises(DeviceSilent):
-            link.request(Trigger(500), Triggered, attempts=1)
+            link.request(ReadCounters(), Counters, attempts=1)
         h.head.filters.clear()
         h.clock.sleep(0.1)
         link.poll()
-        assert link.request(Trigger(700), Triggered).width_us == 700
+        assert link.request(Hello(PROTOCOL_VERSION), Identity).protocol == PROTOCOL_VERSION
 
 
 def test_repeated_request_is_carried_out_once(opened):
+    """A head knows a repetition by its number: it does not read the body again."""
+    link = opened.imu._link
     opened.imu._cancel()
-    deaf_until_ns = opened.clock.now_ns() + 30 * MS
-    opened.head.filters.append(lambda to_head, byte: byte if to_head or opened.clock.now_ns() > deaf_until_ns else None)
-    opened.imu._link.request(Trigger(500), Triggered)
-    opened.clock.sleep(0.1)
-    assert len(opened.head.pulses("trigger")) == 2  # up and down, once
-    assert opened.imu.health()["retries"] == 1
+    link.request(Light(200), Done)
+    link._connection.write(encode(HeadFrame(Light.ID, link._sequence, bytes([5]))))
+    opened.clock.sleep(0.05)
+    opened.head.catch_up()
+    assert opened.head.light == pytest.approx(200 / 255)
 
 
 @AVR_NIGHTLY
@@ -113,7 +118,7 @@ def test_reply_that_arrived_while_the_computer_was_busy_is_accepted(opened, monk
         return written
 
     monkeypatch.setattr(wire, "write", write_and_pause)
-    assert opened.imu._link.request(Trigger(500), Triggered, attempts=1).width_us == 500
+    assert opened.imu._link.request(ReadCounters(), Counters, attempts=1).crc_errors == 0
 
 
 def test_unknown_message_is_rejected(opened):
@@ -121,7 +126,7 @@ def test_unknown_message_is_rejected(opened):
         ID = 0x55
 
     with pytest.raises(RequestRejected, match="does not know this request"):
-        opened.imu._link.request(Future(1), Triggered)
+        opened.imu._link.request(Future(1), Done)
 
 
 # -- a pulled cable -------------------------------------------------------------------------------------------------

@@ -1,12 +1,10 @@
 """Defects of dynamixel-sdk 4.1, one test for each: the rig is not affected."""
 
-import fcntl
 import os
 import re
-import resource
 import threading
 import time
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -264,27 +262,6 @@ def test_any_baud_rate_is_accepted(baud: int) -> None:
     wire.close()
     os.close(near)
     os.close(far)
-
-
-def test_port_works_with_a_large_descriptor_number() -> None:
-    """pyserial waits by `select`, which fails above 1,023: a server with many connections has such descriptors."""
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))
-    far, near = os.openpty()
-    with closing(open_serial(os.ttyname(near), 57_600)) as wire:
-        number = fcntl.fcntl(wire.fd, fcntl.F_DUPFD_CLOEXEC, 1024)
-        os.close(wire.fd)
-        wire.fd = number
-        assert wire.read(1) == b""
-        assert wire.write(b"question") == 8
-        assert os.read(far, 8) == b"question"
-        os.write(far, b"answer")
-        assert wire.read(6) == b"answer"
-        os.close(far)
-        with pytest.raises(serial.SerialException):
-            wire.read(1)
-    os.close(near)
-    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def test_port_in_use_is_reported_as_busy() -> None:

@@ -20,8 +20,6 @@ from rig.devices.head.protocol import (
     Relay,
     Reset,
     Shutdown,
-    Trigger,
-    Triggered,
 )
 from sim.head.board import SimHead
 from sim.head.build import missing
@@ -84,12 +82,6 @@ class Head(RuleBasedStateMachine):
         self.expire()
         if self.ask(Relay(closed), Done) and closed:
             assert self.beaten_ns is not None
-            assert not self.latched
-
-    @rule(width_us=st.integers(10, 3000))
-    def trigger(self, width_us):
-        self.expire()
-        if self.ask(Trigger(width_us), Triggered):
             assert not self.latched
 
     @rule(seen=st.sampled_from([0xFF, int(HeadFault.DEADMAN), int(HeadFault.ESTOP), 0]))

@@ -48,8 +48,6 @@ def eventful(kind: str) -> Trace:
         h.imu.set_light(0.3)
         h.world.drive(to_position(h.clock.now_ns() * 1e-9, 0.0, 0.0, 70.0, 90.0, 300.0))
         for step in range(40):
-            if step == 5:
-                h.imu.trigger(0.001)
             if step == 8:
                 h.head.nack(2)
             if step == 12:
@@ -77,7 +75,7 @@ def test_two_runs_are_identical_to_the_cycle(kind):
     assert first == second
     assert any("e-stop" in error for error in first.errors)
     assert any("restarted" in error for error in first.errors)
-    assert {pin for _, pin, _ in first.pins} == {"light", "relay", "trigger"}
+    assert {pin for _, pin, _ in first.pins} == {"light", "relay"}
     assert sum(len(times) // 8 for times, _, _ in first.samples) > 200
 
 
