@@ -12,7 +12,6 @@ from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.objects.projection import Image
 from sim.objects.shelf import shelf
-from sim.sensor import white_balance
 from sim.world import World
 from tests.sim.drawn_camera import QUIET, Card, Spot, camera, frame, grey, stamp_ns
 
@@ -73,20 +72,6 @@ def test_exposure_and_light_act_linearly(factor: float) -> None:
     np.testing.assert_allclose(frame(camera(world, EXPOSURE=round(100 * factor))), 80 * factor, atol=0.5)
     world.change(light=(factor, 1.0, 1.0))
     assert frame(camera(world)).mean(axis=(0, 1)) == pytest.approx([80 * factor, 80, 80], abs=0.5)
-
-
-def test_white_balance_scales_the_channels() -> None:
-    world = World(noise=QUIET)
-    for level in (60, 120):
-        world.put(grey(level))
-        for kelvin in (3500, 5000, 6500):
-            gains = white_balance(kelvin)
-            assert frame(camera(world, WB_TEMPERATURE=kelvin)).mean(axis=(0, 1)) == pytest.approx(
-                level * np.array(gains), abs=0.5
-            )
-    assert white_balance(5000) == pytest.approx((1, 1, 1))
-    blue, green, red = white_balance(3500)  # tungsten light lacks blue, so the camera adds it
-    assert blue > green > red
 
 
 def test_vignetting_darkens_the_corners_by_its_share() -> None:
@@ -162,20 +147,6 @@ def test_automatic_settings_drift_with_the_scene_until_they_are_off() -> None:
     world.put(grey(20))
     world.clock.sleep(5.0)
     assert (capture.get(cv2.CAP_PROP_EXPOSURE), capture.get(cv2.CAP_PROP_WB_TEMPERATURE)) == settled[1]
-
-
-def test_automatic_exposure_does_not_depend_on_reading_frames() -> None:
-    def exposure(views: int) -> float:
-        world = World(noise=QUIET)
-        world.put(shelf()["teapot"])
-        capture = SimCapture(world)
-        for _ in range(views):
-            world.clock.advance_to(world.clock.now_ns() + 3_000_000_000 // views)
-            capture.read()
-        world.clock.advance_to(4_000_000_000)
-        return capture.get(cv2.CAP_PROP_EXPOSURE)
-
-    assert exposure(1) == exposure(7) == exposure(60)
 
 
 def test_automatic_and_unknown_settings_cannot_be_set_and_values_are_clipped() -> None:

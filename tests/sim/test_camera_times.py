@@ -12,7 +12,6 @@ from sim.frame_times import FPS, row_weights, start_ns
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.objects.projection import CENTRE_PX, PX_PER_MM
-from sim.objects.shelf import shelf
 from sim.world import World
 from tests.fuzzing import examples
 from tests.sim.drawn_camera import QUIET, Spot, camera, frame, grey, stamp_ns
@@ -42,18 +41,6 @@ def test_unfetched_frames_fill_four_buffers_and_later_ones_are_lost() -> None:
     assert world.clock.now_ns() > now_ns  # the four were there at once, the others had to be waited for
     assert stamps[4] > now_ns - 60_000_000
     assert stamps[5] > stamps[4]
-
-
-@pytest.mark.parametrize("buffers", [1, 2, 10])
-def test_number_of_buffers_can_be_chosen(buffers: int) -> None:
-    world = World(noise=QUIET)
-    capture = camera(world, BUFFERSIZE=buffers)
-    world.clock.sleep(1.0)
-    asked_ns = world.clock.now_ns()
-    at_once = 0
-    while capture.grab() and world.clock.now_ns() == asked_ns:
-        at_once += 1
-    assert at_once == buffers
 
 
 @examples(6)
@@ -137,15 +124,6 @@ def test_lost_frames_do_not_arrive() -> None:
         assert capture.grab()
         stamps.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * FPS / 1000))
     assert 1.5 < (stamps[-1] - stamps[0]) / 39 < 2.6
-
-
-def test_views_at_rest_do_not_depend_on_the_errors_of_camera_time() -> None:
-    images = []
-    for noise in (QUIET, QUIET.with_values(camera_readout_ms=20.0, stamp_offset_ms=20.0, stamp_jitter_ms=2.0)):
-        world = World(noise=noise)
-        world.put(shelf()["mug-star"])
-        images.append(frame(camera(world)))
-    assert np.array_equal(*images)
 
 
 def test_mean_time_of_each_row_is_the_middle_of_its_exposure() -> None:

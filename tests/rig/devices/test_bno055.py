@@ -157,40 +157,7 @@ def test_stopped_fusion_is_detected(bench: ImuBench, imu: Bno055) -> None:
     assert "i2c-gpio" in caught.value.next_step
 
 
-def test_changed_units_are_detected(bench: ImuBench, imu: Bno055) -> None:
-    bench.sensor._registers[0x3B] = 0x02  # another program wants radians
-    with pytest.raises(DeviceFault) as caught:
-        imu.read_samples()
-    assert caught.value.evidence["unit_selection"] == {"got": 2, "expected": 0}
-
-
-def test_stuck_bus_and_missing_sensor_are_distinguished(bench: ImuBench, imu: Bno055) -> None:
-    bench.bus.stuck = True
-    with pytest.raises(DeviceSilent, match="stuck") as caught:
-        imu.read_samples()
-    assert "SDA" in caught.value.next_step
-
-
-def test_failed_transfer_is_repeated(bench: ImuBench, imu: Bno055) -> None:
-    imu.read_samples()
-    bench.clock.sleep(0.1)
-    bench.bus.nack(1)
-    assert imu.read_samples().time_ns.size == pytest.approx(10, abs=1)
-    assert imu.statistics.retries == 1
-
-
 # -- on a bench --------------------------------------------------------------------------------------------------------
-
-
-def test_bench_with_bno055_moves_settles_and_agrees(simulated) -> None:
-    b = simulated("imu.model=bno055", seed=3)
-    assert b.bench.imu.identity.bus_address == AT
-    with Turntable(b.bench) as table:
-        for angle in (30.0, 60.0, -90.0, 0.0):
-            move = table.goto(angle)
-            assert move.agreement is not None, move.gyro.reason
-            assert move.agreement.agrees
-            assert move.gyro.angle_deg == pytest.approx(move.rotation_encoder_deg, abs=1.5)
 
 
 # -- clock stretching on a Raspberry Pi 4 -----------------------------------------------------------------------------

@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 
 from rig.core.errors import DeviceFault, DeviceSilent
 from rig.devices.mpu6050 import Mpu6050
-from sim.motion import to_position
 from tests.fuzzing import examples
 from tests.rig.imu_bench import AT, ImuBench
-from tests.sim.truth import table_rates
 
 # -- samples ------------------------------------------------------------------------------------------------------
 
@@ -68,22 +66,6 @@ def test_times_follow_a_sensor_whose_clock_is_off(bench: ImuBench, clock_error: 
         assert before_ns - 5_000_000 <= samples.time_ns[-1] <= bench.clock.now_ns()
         assert samples.time_ns[0] > last_ns
         last_ns = samples.time_ns[-1]
-
-
-def test_samples_match_the_motion(bench: ImuBench) -> None:
-    """The order within the FIFO and the times: each sample shows the rate of its own moment (less the filter's lag)."""
-    imu = bench.open(bandwidth_hz=188)
-    now_s = bench.clock.now_ns() * 1e-9
-    imu.read_samples()
-    bench.world.drive(to_position(now_s, 0.0, 0.0, 60.0, 120.0, 400.0))
-    parts = []
-    for _ in range(8):
-        bench.clock.sleep(0.1)
-        parts.append(imu.read_samples())
-    time_ns = np.concatenate([p.time_ns for p in parts])
-    rate = np.concatenate([p.gyro_dps[:, 2] for p in parts])
-    assert rate.max() == pytest.approx(120, abs=1)
-    np.testing.assert_allclose(rate, table_rates(bench.world, time_ns), atol=400 * 0.006)
 
 
 def test_reading_samples_takes_two_transactions(bench: ImuBench, imu: Mpu6050) -> None:

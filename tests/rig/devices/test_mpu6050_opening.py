@@ -12,19 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from smbus2.smbus2 import I2C_SMBUS
 
-from rig.config import load_config
 from rig.core.errors import ConfigError, ControllerHangs, DeviceFault, DeviceMismatch, DeviceNotFound
 from rig.core.next_steps import Do
 from rig.devices.bno055 import Bno055
 from rig.devices.i2c import DESIGNWARE
 from rig.devices.mpu6050 import Mpu6050, Mpu6050Clone, Mpu6500, Mpu9250
-from sim.bench import ShelfOperator, open_sim_bench
 from sim.clock import VirtualClock
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone, SimMpu6500, SimMpu9250
 from sim.noise import NoiseModel
-from sim.objects.shelf import shelf
-from sim.world import World
 from tests.rig.imu_bench import AT, ImuBench
 
 # -- opening ------------------------------------------------------------------------------------------------------
@@ -93,15 +89,6 @@ def test_fifo_of_512_bytes_is_read_until_it_is_full(driver: type[Mpu6050], devic
         assert imu.read_samples().lost == pytest.approx(90, abs=3)  # reading 504 bytes takes 11 ms
 
 
-@pytest.mark.parametrize(("driver", "device"), PARTS[:2])
-def test_temperature_has_the_scale_of_the_part(driver: type[Mpu6050], device: type[SimMpu6050]) -> None:
-    with ImuBench(device=device) as bench:
-        bench.sensor.temperature_c = 31.5
-        imu = bench.open(driver)
-        bench.clock.sleep(0.1)
-        assert imu.temperature_c() == pytest.approx(31.5, abs=0.01)
-
-
 def test_mpu6500_that_is_awake_after_a_reset_is_a_fault() -> None:
     with ImuBench(device=SimMpu6500) as bench:
         imu = bench.open(Mpu6500)
@@ -142,13 +129,6 @@ def test_clone_with_implausible_samples_is_rejected(spoil: Any, problem: str) ->
         spoil(bench.sensor)
         with pytest.raises(DeviceMismatch, match=problem):
             bench.open(Mpu6050Clone)
-
-
-def test_opening_a_bench_notes_a_clone() -> None:
-    world = World(seed=1)
-    with open_sim_bench(load_config(None, ["imu.model=mpu6050_clone"]), ShelfOperator(world, shelf())) as bench:
-        assert bench.imu.identity.gyro_noise_dps_rthz == 0.01
-        assert any("clone" in finding for finding in bench.findings)
 
 
 def test_missing_sensor_names_address_and_next_step(bench: ImuBench) -> None:
@@ -236,24 +216,3 @@ def test_rate_is_set_exactly_or_rejected(rate_hz: float) -> None:
             assert not divides
         else:
             assert any(rate_hz == pytest.approx(1000 / n) for n in range(1, 257))
-
-
-def test_sensor_that_loses_settings_is_a_fault(bench: ImuBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = bench.sensor.write
-    monkeypatch.setattr(bench.sensor, "write", lambda data: kept(data[:1]) + len(data) - 1)
-    with pytest.raises(DeviceFault) as caught:
-        bench.open()
-    assert caught.value.evidence["register_0x23"] == {"got": "00", "expected": "70"}
-
-
-def test_closed_driver_leaves_no_open_file(bench: ImuBench) -> None:
-    before = open_files()
-    imu = bench.open()
-    assert open_files() == before + 1
-    imu.close()
-    imu.close()
-    assert open_files() == before
-    bench.bus.detach(AT)
-    with pytest.raises(DeviceNotFound):
-        bench.open()
-    assert open_files() == before

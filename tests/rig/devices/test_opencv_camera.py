@@ -194,24 +194,6 @@ def test_opening_errors_name_the_cause(tmp_path: Path) -> None:
 # -- recordings and streams -------------------------------------------------------------------------------------------
 
 
-def test_recording_is_read_frame_by_frame(tmp_path: Path, world: World) -> None:
-    levels = (10, 90, 170)
-    for k, level in enumerate(levels):
-        cv2.imwrite(str(tmp_path / f"img_{k:02d}.png"), np.full((48, 64, 3), level, np.uint8))
-    camera = OpenCvCamera(open_capture(tmp_path / "img_%02d.png"), clock=world.clock)
-    assert camera.time_base is TimeBase.RECORDED
-    assert "exposure_100us" in {n.setting for n in camera.rejected_settings}
-    assert camera.read_locks().exposure_us is None
-    for level in levels:
-        after_ns = world.clock.now_ns() + 1000
-        frame = camera.capture(after_ns)
-        assert frame.exposed_ns >= after_ns
-        assert (frame.image_bgr == level).all()
-    with pytest.raises(DeviceSilent) as error:
-        camera.capture(world.clock.now_ns())
-    assert "end" in error.value.next_step
-
-
 @pytest.fixture
 def stream() -> Iterator[tuple[str, list[float]]]:
     """An MJPEG stream on the loopback whose brightness can be set: the one source here that runs in real time."""

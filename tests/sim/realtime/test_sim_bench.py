@@ -430,8 +430,3 @@ def test_lost_connection_is_an_error_of_the_device(tmp_path):
         wire.ask(ask="do", words=[])
     wire.close()
     listener.close()
-
-
-def test_request_must_be_plain_json():
-    with pytest.raises(ValueError, match="NaN"):
-        json_values('{"ask": NaN}')
