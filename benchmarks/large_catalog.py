@@ -1,21 +1,18 @@
 """Builds a catalog of 1,000 objects with 72 views, with the records of a real bench and tiny images.
 
-python -m benchmarks.large_catalog FOLDER [OBJECTS] [--images]
+python -m benchmarks.large_catalog FOLDER [OBJECTS]
 
-All objects have the same records, with descriptors of their own, and all views the same black image. With ``--images``
-each view shows one of four objects of the simulator in 320x240, for `rig catalog verify`.
+All objects have the same records, with descriptors of their own, and all views the same black image.
 """
 
 import argparse
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import insert
 from sqlalchemy.orm import Session as Transaction
 
@@ -30,7 +27,6 @@ from rig.catalog import (
     Provenance,
     Session,
     View,
-    derived,
     describing,
     log,
     state,
@@ -39,9 +35,6 @@ from rig.catalog.facts import Derived, Entry, digest_of, seal_of
 from rig.core.clock import SystemClock
 from rig.views import image_files
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
-from sim.camera import SimCapture
-from sim.objects.shelf import shelf
-from sim.world import World
 
 OBJECTS = 1_000
 #: The evidence that a bench stores with a view.
@@ -75,43 +68,24 @@ _PROVENANCE = Provenance(
 )
 
 
-_SHOWN = ("mug-star", "teapot", "toy-car", "radio")
-
-
-def build(folder: Path, objects: int = OBJECTS, *, images: bool = False) -> Views:
+def build(folder: Path, objects: int = OBJECTS) -> Views:
     """Make the catalog in a new folder, and return the views in it."""
     views = model(objects)
     with Catalog.open(folder, clock=SystemClock()) as catalog:
-        shown = _put(catalog, _frames() if images else [[np.zeros((480, 560, 3), np.uint8)]])
+        png = image_files.encode(np.zeros((480, 560, 3), np.uint8))
+        image = catalog.database.images.put(png, settled=False), len(png)
         with catalog.database.write() as transaction:
-            log.add(transaction, *_entries(transaction, catalog, views, shown))
-        if images:
-            for kind in (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR):
-                derived.views(catalog, kind)
-        else:
-            _describe(catalog, views)
+            log.add(transaction, *_entries(transaction, catalog, views, *image))
+        _describe(catalog, views)
     return views
 
 
-def _put(catalog: Catalog, frames: Sequence[Sequence[NDArray[np.uint8]]]) -> list[list[tuple[str, int]]]:
-    """Store the frames, and return the name and size of each."""
-    found = []
-    for of_object in frames:
-        encoded = [image_files.encode(frame) for frame in of_object]
-        found.append([(catalog.database.images.put(png, settled=False), len(png)) for png in encoded])
-    return found
-
-
-def _entries(
-    transaction: Transaction, catalog: Catalog, views: Views, shown: Sequence[Sequence[tuple[str, int]]]
-) -> Iterator[Entry]:
+def _entries(transaction: Transaction, catalog: Catalog, views: Views, image: str, size: int) -> Iterator[Entry]:
     """Insert the rows of all objects, and yield the lines of the log about them."""
     now = catalog.clock.utc()
-    region = (40, 0, 240, 240) if len(shown) > 1 else (80, 0, 480, 480)
     for j, name in enumerate(views.object_names):
         own = views.of(j)
         azimuths_deg = tuple(views.azimuth_deg[own].tolist())
-        images = shown[j % len(shown)]
         key = hashlib.sha256(name.encode()).hexdigest()
         enrollment = Enrollment(key=key, object_id=j + 1, started_utc=now, planned_azimuth_deg=azimuths_deg)
         session = Session(number=0, started_utc=now, provenance=_PROVENANCE)
@@ -125,9 +99,9 @@ def _entries(
                 azimuth_deg=azimuth_deg,
                 captured_ns=i,
                 evidence=_EVIDENCE,
-                region=region,
-                image=images[i % len(images)][0],
-                image_bytes=images[i % len(images)][1],
+                region=(80, 0, 480, 480),
+                image=image,
+                image_bytes=size,
             )
             for i, azimuth_deg in enumerate(azimuths_deg)
         ]
@@ -170,25 +144,6 @@ def _describe(catalog: Catalog, views: Views) -> None:
             transaction.execute(insert(Derived).values(describing.row_of(one.seal, describing.SEGMENTATION, evidence)))
 
 
-def _frames() -> list[list[NDArray[np.uint8]]]:
-    """Return frames of each object in `_SHOWN`, uint8 (240, 320, 3), at the azimuths of its views."""
-    world = World(seed=1)
-    capture = SimCapture(world)
-    capture.set(cv2.CAP_PROP_FRAME_WIDTH, 320)
-    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, 240)
-    capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1)
-    capture.set(cv2.CAP_PROP_AUTO_WB, 0)
-    found: list[list[NDArray[np.uint8]]] = []
-    for name in _SHOWN:
-        found.append([])
-        for i in range(VIEWS_OF_AN_OBJECT):
-            world.put(shelf()[name], i * 360 / VIEWS_OF_AN_OBJECT)
-            taken, frame = capture.read()
-            assert taken
-            found[-1].append(np.asarray(frame, np.uint8))
-    return found
-
-
 def _rotating(size: int, views: int, seed: int) -> LevelArray:
     """Return packed levels of an object's views: a third of them changes slowly with the azimuth."""
     rng = np.random.default_rng(seed)
@@ -202,7 +157,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("objects", type=int, nargs="?", default=OBJECTS)
-    parser.add_argument("--images", action="store_true")
     arguments = parser.parse_args()
-    build(arguments.folder, arguments.objects, images=arguments.images)
+    build(arguments.folder, arguments.objects)
     print(f"{arguments.folder}: {VIEWS_OF_AN_OBJECT} views an object")

@@ -7,7 +7,7 @@ kept. The digest of the file is checked, because the same view must give the sam
 
 The layer has 112 channels. They are averaged over 4 x 4 cells, and a fixed projection reduces these 1792 numbers to
 256: numbers that change with bench, light, noise and blur count little. ``network.npz`` has the projection; it was
-fitted to objects 1-50 of COIL-100 on drawn benches (`python -m benchmarks.fit_projection`).
+fitted to objects 1-50 of COIL-100 on drawn benches by `benchmarks/fit_projection.py` at the commit `1252e81d`.
 
 Source: M. Tan and Q. V. Le, "EfficientNet: Rethinking model scaling for convolutional neural networks", ICML 2019.
 
