@@ -32,9 +32,7 @@ def output(name: str, folder: Path) -> str:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("name", "last"), [("bench_cedd", "hbr.describe"), ("bench_views", "in motion")]
-)
+@pytest.mark.parametrize(("name", "last"), [("bench_cedd", "hbr.describe"), ("bench_views", "in motion")])
 def test_short_benchmarks_run_to_their_end(name: str, last: str, tmp_path: Path) -> None:
     assert last in output(name, tmp_path).splitlines()[-1]
 

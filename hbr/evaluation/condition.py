@@ -199,8 +199,8 @@ def _textured(image: ImageArray, rng: np.random.Generator) -> ImageArray:
     return np.clip(texture, 0, 255).astype(np.uint8)
 
 
-def enrolled_levels(dataset: Dataset, j: int, condition: Condition, places: Iterable[int] | None = None) -> LevelArray:
-    """Return the descriptors of enrolled views of object `j`, uint8 (n, length): of all photographs, or these.
+def enrolled_levels(dataset: Dataset, j: int, condition: Condition) -> LevelArray:
+    """Return the descriptors of all photographs of object `j` as enrolled views, uint8 (n, length).
 
     Raises
     ------
@@ -208,8 +208,7 @@ def enrolled_levels(dataset: Dataset, j: int, condition: Condition, places: Iter
         A photograph cannot be used, or has another size.
     """
     name = dataset.objects[j].name
-    places = range(len(dataset.objects[j].photographs)) if places is None else places
-    images = ((i, dataset.image(j, i)) for i in places)
+    images = ((i, dataset.image(j, i)) for i in range(len(dataset.objects[j].photographs)))
     return _levels((condition.enrolled(image, generator(0, name, "enrolled", i)) for i, image in images), condition)
 
 

@@ -9,10 +9,9 @@ from hbr.evaluation.condition import Condition
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.protocol import Method, Protocol
 
-KindName = Literal["trials", "matrix", "bench-change", "replaced"]
 Change = Literal["none", "mild", "hard"]
 #: Increased if the same settings give other numbers.
-FORMAT: Final = 12
+FORMAT: Final = 13
 
 
 @dataclass(frozen=True)
@@ -23,60 +22,53 @@ class Experiment:
     ----------
     name : str
         Name in files and reports.
-    kind : {"trials", "matrix", "bench-change", "replaced"}
-        ``trials`` compares methods; ``matrix`` measures one perturbation at a time; ``bench-change`` searches after a
-        change of a whole drawn bench, or in the photographs as they are, also for objects that are left out;
-        ``replaced`` replaces the object during the search.
     condition : Condition
         How the images of queries differ from those of enrolled views.
     protocol : Protocol
         The settings of the trials.
     methods : tuple of Method
-        The methods of ``trials``.
+        The methods that are compared, if the bench does not change.
     objects, report : (int, int) or None
         First and last object of the data set that takes part, and that is reported, counted from 1; None: all.
     every : int
         Step between the photographs of an object that are used: with 2, every second one.
-    change : {"none", "mild", "hard"}
-        The change of ``bench-change``; none: the photographs as they are, with the noise of the condition, and queries
+    change : {"none", "mild", "hard"} or None
+        None: trials that compare methods. Else searches of the rig, also for objects that are left out, after this
+        change of a whole drawn bench; none: the photographs as they are, with the noise of the condition, and queries
         that are not enrolled.
     plain : bool
-        Whether all benches of ``bench-change`` have a plain backdrop and a visible platter.
+        Whether all drawn benches have a plain backdrop and a visible platter.
     margin, min_views
         Lead per view, and number of views, that end a search of the paper.
     """
 
     name: str
-    kind: KindName = "trials"
     condition: Condition = field(default_factory=Condition)
     protocol: Protocol = field(default_factory=Protocol)
     methods: tuple[Method, ...] = ()
     objects: tuple[int, int] | None = None
     report: tuple[int, int] | None = None
     every: int = 1
-    change: Change = "hard"
+    change: Change | None = None
     plain: bool = False
     margin: float = 0.02
     min_views: int = 2
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(KindName):
-            raise ValueError(f"kind {self.kind!r} is unknown; use one of {', '.join(get_args(KindName))}")
-        if self.change not in get_args(Change):
+        if self.change is not None and self.change not in get_args(Change):
             raise ValueError(f"change {self.change!r} is unknown; use none, mild or hard")
-        if self.kind == "bench-change" and self.change == "none" and self.condition.reference != "none":
+        if self.change == "none" and self.condition.reference != "none":
             raise ValueError("photographs as they are have no empty-table image; give reference = none")
         if self.every < 1:
             raise ValueError(f"every is {self.every}; at least 1 is needed")
-        if self.kind in ("matrix", "bench-change", "replaced") and self.protocol.enrolled is None:
-            raise ValueError(f"{self.kind} needs the number of enrolled views; give enrolled = 18")
+        if self.change is not None and self.protocol.enrolled is None:
+            raise ValueError("a change of the bench needs the number of enrolled views; give enrolled = 18")
 
     def settings(self, dataset: Dataset) -> dict[str, Any]:
         """Return everything that determines the results, as JSON values with units in the keys."""
         condition, (width, height) = self.condition, dataset.size
         return {
             "format": FORMAT,
-            "kind": self.kind,
             "dataset": {
                 "name": dataset.name,
                 "objects": [item.name for item in dataset.objects],
@@ -94,8 +86,8 @@ class Experiment:
             "protocol": asdict(self.protocol),
             "methods": [asdict(method) for method in self.methods],
             "every": self.every,
-            "change": self.change if self.kind == "bench-change" else None,
-            "plain": self.plain if self.kind == "bench-change" else None,
+            "change": self.change,
+            "plain": self.plain,
         }
 
 

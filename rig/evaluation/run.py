@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from hbr.evaluation.changes import BENCH_CHANGE
-from hbr.evaluation.experiment import Experiment, Kind
-from hbr.evaluation.matrix import MATRIX
+from hbr.evaluation.experiment import Experiment
 from hbr.evaluation.photographs import Dataset
-from hbr.evaluation.replaced import REPLACED
 from hbr.evaluation.trials import TRIALS
 from rig.charts.evaluation_figures import figures
 from rig.core.clock import SystemClock
@@ -26,12 +24,6 @@ from rig.evaluation.tables import rows_of
 
 FOLDER: Final = Path("rig-eval")
 """The folder of all results without a folder of their own choice."""
-_KINDS: Final[Mapping[str, Kind]] = {
-    "trials": TRIALS,
-    "matrix": MATRIX,
-    "bench-change": BENCH_CHANGE,
-    "replaced": REPLACED,
-}
 _MAX_NAME: Final = 60  # the end of a name distinguishes runs, and file systems end names at 255 bytes
 _T = TypeVar("_T")
 
@@ -46,7 +38,7 @@ def run_experiment(
     Raises `DatasetError`, `ValueError`: a photograph cannot be used, or there are too few objects or views for the
     experiment.
     """
-    kind, dataset = _KINDS[experiment.kind], dataset.every(experiment.every)
+    kind, dataset = TRIALS if experiment.change is None else BENCH_CHANGE, dataset.every(experiment.every)
 
     def of_each(work: Callable[[int], _T], done: str) -> list[_T]:
         found: dict[int, _T] = {}

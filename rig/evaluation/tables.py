@@ -1,6 +1,6 @@
 """Results of an experiment as tables of texts: each is made of the rows that ``results.csv`` has."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,37 +43,22 @@ def rows_of(results: Mapping[str, Any]) -> list[Row]:
 def tables(results: Mapping[str, Any]) -> list[Rows]:
     """Return the tables that the terminal shows."""
     rows = rows_of(results)
-    match results["settings"]["kind"]:
-        case "trials":
-            stated = {method["label"]: method["stopping"]["pose"] for method in results["methods"]}
-            return [_curves(results, rows), _decisions(results), _stated(stated), _poses(results)]
-        case "matrix":
-            return [_matrix(rows)]
-        case "replaced":
-            return [_replaced(rows)]
-        case _:
-            by_change = {f"{row['change']}, {row['objects']}": row for row in rows}
-            return [_changes(rows), _intervals(rows), _probabilities(by_change), _stated(by_change)]
-
-
-def _pivot(
-    heading: str, rows: Sequence[Row], name: Callable[[Row], str], across: str, cell: Callable[[Row], str]
-) -> Rows:
-    """Return a table with a line for each name, and a column for each value of the key ``across``."""
-    values = sorted({row[across] for row in rows})
-    lines: dict[str, dict[Any, str]] = {}
-    for row in rows:
-        lines.setdefault(name(row), {})[row[across]] = cell(row)
-    return Rows([heading, *map(str, values)], [[key, *(own.get(v, "") for v in values)] for key, own in lines.items()])
+    if "methods" in results:
+        stated = {method["label"]: method["stopping"]["pose"] for method in results["methods"]}
+        return [_curves(results, rows), _decisions(results), _stated(stated), _poses(results)]
+    by_change = {f"{row['change']}, {row['objects']}": row for row in rows}
+    return [_changes(rows), _intervals(rows), _probabilities(by_change), _stated(by_change)]
 
 
 def _curves(results: Mapping[str, Any], rows: Sequence[Row]) -> Rows:
-    labels = {method["name"]: method["label"] for method in results["methods"]}
-    found = _pivot(
-        "hit rate, %, at N =", rows, lambda row: row["method"], "views", lambda row: _percent(row["hit_rate"])
-    )
-    best10 = {row["method"]: _percent(row["best10_rate"]) for row in rows}  # after the last view
-    return Rows([*found.columns, "best 10"], [[labels[name], *cells, best10[name]] for name, *cells in found.rows])
+    """Return a line for each method, and a column for each number of views."""
+    views = sorted({row["views"] for row in rows})
+    lines = []
+    for method in results["methods"]:
+        own = {row["views"]: row for row in rows if row["method"] == method["name"]}
+        rates = [_percent(own[n]["hit_rate"]) if n in own else "" for n in views]
+        lines.append([method["label"], *rates, _percent(own[max(own)]["best10_rate"])])
+    return Rows(["hit rate, %, at N =", *map(str, views), "best 10"], lines)
 
 
 def _decisions(results: Mapping[str, Any]) -> Rows:
@@ -121,40 +106,6 @@ def _stated(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
         return ["–" if value is None else f"{scale * value:.1f}" for value, scale in values]
 
     return Rows(heads.split("|"), [[name, *cells(own)] for name, own in rates.items()])
-
-
-def _matrix(rows: Sequence[Row]) -> Rows:
-    """Return perturbations by strengths, with the hit rates in percent after one view and after all."""
-    last = max(row["views"] for row in rows)
-    first = {(row["kind"], row["strength"]): _percent(row["hit_rate"]) for row in rows if row["views"] == 1}
-    return _pivot(
-        f"hit rate, %, N = 1 / {last}; strength",
-        [row for row in rows if row["views"] == last],
-        lambda row: row["kind"],
-        "strength",
-        lambda row: f"{first[row['kind'], row['strength']]} / {_percent(row['hit_rate'])}",
-    )
-
-
-def _replaced(rows: Sequence[Row]) -> Rows:
-    """Return the shares of searches in percent; enrolled objects are marked +, others -.
-
-    They noticed a change within one to three thirds of the views since; after "running", only searches count that their
-    stopping rule would not have ended.
-    """
-    shares = ("noticed_1", "noticed_2", "noticed_3", "noticed_running", "wrong", "wrong_running")
-    heads = "%|n|seen ⅓|⅔|all|running|wrong|running|right|no test"
-    return Rows(
-        heads.split("|"),
-        [
-            [
-                f"{row['way']}: {row['case']} {'-+'[row['before_enrolled']]}{'-+'[row['after_enrolled']]}",
-                f"{row['searches']}",
-                *(_percent(row[share]) for share in (*shares, "right", "right_without")),
-            ]
-            for row in rows
-        ],
-    )
 
 
 def _changes(rows: Sequence[Row]) -> Rows:
