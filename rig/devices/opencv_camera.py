@@ -43,7 +43,7 @@ _STAMP_ERROR_NS = 2_000_000  # how far a stamp may be ahead of the clock
 _SLICE_S = 0.1  # longest wait for a frame between two calls of ``meanwhile``
 _REPLUG_PAUSE_S = 0.1
 _UNKNOWN_PROPERTY = cv2.CAP_PROP_XI_AEAG  # V4L2 answers -1, other sources 0
-_EXPOSURE_CHANGE_FRAMES = 4  # a sensor applies a new exposure time up to this number of frames later
+
 _FOCUS_STILL_S, _FOCUS_LIMIT_S = 1.0, 8.0
 _FOCUS_CHANGE = 0.1  # share of the sharpness that changes while the lens moves
 
@@ -195,15 +195,6 @@ class OpenCvCamera:
         return CameraLocks(
             **{name: None if value is None else convert(value) for name, (value, convert) in reported.items()}
         )
-
-    def change_exposure(self, exposure_us: float) -> int:
-        """Change the locked exposure time until the camera is opened again.
-
-        Return the time in ns from which `capture` returns frames of this exposure time: it takes the camera some
-        frames.
-        """
-        self._capture.set(cv2.CAP_PROP_EXPOSURE, round(exposure_us / _EXPOSURE_UNIT_US))
-        return self._clock.now_ns() + round(_EXPOSURE_CHANGE_FRAMES * max(self._period_s, *self._waits_s) * 1e9)
 
     def close(self) -> None:
         self._capture.release()

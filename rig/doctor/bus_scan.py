@@ -1,7 +1,7 @@
 """Scan servo buses and I2C buses for devices; the scan changes nothing."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from errno import EBUSY
@@ -86,6 +86,19 @@ def scan_servos(wire: SerialConnection, clock: Clock, bauds: Sequence[int] = BAU
     finally:
         with suppress(serial.SerialException, OSError, ValueError):
             wire.baudrate = before
+
+
+def scan_rates(
+    wire: SerialConnection, clock: Clock, rates: Iterable[int], port: str
+) -> Generator[str, None, list[BaudScan]]:
+    """Scan at each baud rate, and yield a text before each; a duplicate id ends the scan."""
+    scans: list[BaudScan] = []
+    for rate in rates:
+        yield f"{port}: scanning at {rate} baud ..."
+        scans += scan_servos(wire, clock, [rate])
+        if scans and scans[-1].duplicate_ids:
+            break
+    return scans
 
 
 def without_echoes(scans: Sequence[BaudScan], preferred: int) -> list[BaudScan]:

@@ -1,9 +1,9 @@
 """Check the camera: its mode, its locks, and the age and quality of its frames."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,37 +11,33 @@ from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
-from rig.core.next_steps import Do, SomeSteps
+from rig.core.next_steps import Do, NextStep, SomeSteps, as_steps
 from rig.devices.camera import CameraLocks
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.v4l2 import choose_mode
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
+from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, warning
 from rig.safety.saved_state import FileStore
 from rig.views.capture import ImageQuality, rejection_text
 
-_SETTINGS = {
-    "exposure": "exposure_100us",
-    "white balance": "white_balance_k",
-    "gain": "gain",
-    "focus": "focus",
-    "sharpness": "sharpness",
-    "backlight compensation": "backlight_compensation",
-    "power-line frequency": "power_line_frequency",
-    "frame rate": "dynamic_frame_rate",
-}
-"""The camera's setting for each name in words."""
 _MAINS = {0.0: "off", 1.0: "50 Hz", 2.0: "60 Hz", 3.0: "automatic"}
 """Values of V4L2_CID_POWER_LINE_FREQUENCY (Linux, `v4l2-controls.h`)."""
 _RATE = {True: "varies with the light", False: "constant"}
+_LOCKS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "exposure": ("exposure_us", lambda us: f"{us / 1e3:g} ms"),
+    "white balance": ("white_balance_k", "{:g} K".format),
+    "gain": ("gain", "{:g}".format),
+    "focus": ("focus", "{:g}".format),
+    "sharpness": ("sharpness", "{:g}".format),
+    "backlight compensation": ("backlight_compensation", "{:g}".format),
+    "power-line frequency": ("power_line_frequency", lambda value: _MAINS.get(value, f"{value:g}")),
+    "frame rate": ("dynamic_frame_rate", lambda varies: _RATE[varies]),
+}
+"""The attribute of `CameraLocks` for each name in words, and how its value is written."""
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
 """Largest time from the start of an exposure until the program has the frame; the table waits for it at each view."""
-PER_EXPOSURE = 6
-"""Images of each exposure time that are compared to find bands that stand still."""
-DARK, BRIGHT = 12, 240
-"""Levels between which a pixel shows the light."""
 EXPOSURE_STEP_US = 100.0
 """Cameras round exposure times to this step."""
 MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
@@ -116,10 +112,9 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         found = {"setting": one.setting, "requested": one.asked, "reported": one.reported}
         steps: SomeSteps = fix
         if one.reported == NO_CONTROL:
-            key = "exposure_us" if one.setting == "exposure_100us" else one.setting
             steps = (
                 "Views of one object differ if the light changes: keep it constant, or use a camera with this control.",
-                Do.SET_KEY(key=f"camera.{key}", value="none"),
+                Do.SET_KEY(key=f"camera.{_key(one.setting)}", value="none"),
             )
         yield warning("camera", FindingCode.SETTING_REJECTED, steps, **found)
     wanted = context.config.camera
@@ -136,37 +131,25 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     ]
     if not_locked:
         yield warning("camera", FindingCode.NOT_LOCKED, fix, settings=not_locked)
-    rejected = {one.setting for one in source.rejected_settings}
+    rejected = {_key(one.setting) for one in source.rejected_settings}
     locked = [
         f"{name} {value}"
         for name, value in lock_words(locks).items()
-        if name not in not_locked and _SETTINGS[name] not in rejected
+        if name not in not_locked and _LOCKS[name][0] not in rejected
     ]
     if locked:
         yield fine("camera", FindingCode.LOCKED, settings=locked)
 
 
+def _key(setting: str) -> str:
+    """Return the key of a setting that the driver has requested."""
+    return "exposure_us" if setting == "exposure_100us" else setting
+
+
 def lock_words(locks: CameraLocks) -> dict[str, str]:
     """Return the settings that the camera reports, by name: "exposure": "10 ms"."""
-    words = {
-        "exposure": None if locks.exposure_us is None else f"{locks.exposure_us / 1e3:g} ms",
-        "white balance": None if locks.white_balance_k is None else f"{locks.white_balance_k:g} K",
-        "gain": _text(locks.gain),
-        "focus": _text(locks.focus),
-        "sharpness": _text(locks.sharpness),
-        "backlight compensation": _text(locks.backlight_compensation),
-        "power-line frequency": _mains(locks.power_line_frequency),
-        "frame rate": None if locks.dynamic_frame_rate is None else _RATE[locks.dynamic_frame_rate],
-    }
-    return {name: value for name, value in words.items() if value is not None}
-
-
-def _text(value: float | None) -> str | None:
-    return None if value is None else f"{value:g}"
-
-
-def _mains(value: float | None) -> str | None:
-    return None if value is None else _MAINS.get(value, f"{value:g}")
+    values = {name: getattr(locks, attribute) for name, (attribute, _) in _LOCKS.items()}
+    return {name: _LOCKS[name][1](value) for name, value in values.items() if value is not None}
 
 
 def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
@@ -229,24 +212,17 @@ _STANDS = 0.1
 _CYCLES = np.arange(0.0, 8.01, 0.125)
 """Bands in an image: at most 8, for a readout of 67 ms at 120 Hz."""
 _BLOCKS = 48  # six for each band at most; more blocks are noisier
-_STANDING_CYCLES = _CYCLES[_CYCLES >= 0.75]
-"""Smallest number of bands; fewer look like a change of the scene from its top to its bottom."""
 
 
-@dataclass(frozen=True, slots=True)
-class MainsFlicker:
+class MainsFlicker(NamedTuple):
     """Flicker at twice the mains frequency; ``depth`` is its amplitude as a share of the mean level."""
 
     mains_hz: float
     depth: float
 
-    def exposure_us(self, wanted_us: float) -> float:
-        """Return the exposure time without bands that is nearest to ``wanted_us``: whole periods of the lamp."""
-        return whole_periods_us(self.mains_hz, wanted_us)
-
 
 def whole_periods_us(mains_hz: float, wanted_us: float) -> float:
-    """Return the exposure time without bands that is nearest to ``wanted_us``."""
+    """Return the exposure time without bands that is nearest to ``wanted_us``: whole periods of the lamp."""
     period_us = 1e6 / (2 * mains_hz)
     return float(round(max(round(wanted_us / period_us), 1) * period_us))
 
@@ -256,30 +232,27 @@ def mains_flicker(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64]) 
 
     The row at the share y of the height is exposed later by y times the readout. So a lamp with the frequency f adds
     cos(2π (f t + c y)) to the image at time t, with c bands. Both are fitted to the changes of each row. Bands that
-    stand still, because f is a multiple of the frame rate, are not recognised: see `standing_flicker`.
+    stand still, because f is a multiple of the frame rate, cannot be told from the scene: see `standing_mains_hz`.
 
     ``row_levels``, float64 (n, H), is the mean level of each row of n images at ``times_ns``, int64 (n,).
     """
     count, height = row_levels.shape
     if count < 4 or height < _BLOCKS:
         return None
-    usable = _blocks(row_levels)
-    mean = usable.mean(axis=0)
-    changes = usable / np.maximum(mean, 1.0) - 1.0
+    blocks = row_levels[:, : height - height % _BLOCKS].reshape(count, _BLOCKS, -1).mean(axis=-1)
+    changes = blocks / np.maximum(blocks.mean(axis=0), 1.0) - 1.0
     power = float((changes**2).mean())
     if power == 0.0:
         return None
-    bands = np.exp(-2j * np.pi * np.outer(_MIDDLES, _CYCLES))
-    best: tuple[float, float] = (0.0, 0.0)
+    bands = np.exp(-2j * np.pi * np.outer((np.arange(_BLOCKS) + 0.5) / _BLOCKS, _CYCLES))
+    best = MainsFlicker(0.0, 0.0)
     for mains_hz in MAINS_HZ:
         phases = _phases(mains_hz, times_ns)
-        if (weight := float((np.abs(phases) ** 2).mean())) < _STANDS:
-            continue
-        fitted = np.abs(phases @ changes @ bands).max() / (count * _BLOCKS * weight)
-        best = max(best, (2 * float(fitted), mains_hz))
-    depth, mains_hz = best
-    explained = depth**2 / 2 / power
-    return MainsFlicker(mains_hz, depth) if depth >= MIN_DEPTH and explained >= _MIN_EXPLAINED else None
+        if (weight := float((np.abs(phases) ** 2).mean())) >= _STANDS:
+            fitted = np.abs(phases @ changes @ bands).max() / (count * _BLOCKS * weight)
+            best = max(best, MainsFlicker(mains_hz, 2 * float(fitted)), key=lambda one: one.depth)
+    explained = best.depth**2 / 2 / power
+    return best if best.depth >= MIN_DEPTH and explained >= _MIN_EXPLAINED else None
 
 
 def standing_mains_hz(times_ns: NDArray[np.int64]) -> tuple[float, ...]:
@@ -287,75 +260,10 @@ def standing_mains_hz(times_ns: NDArray[np.int64]) -> tuple[float, ...]:
     return tuple(hz for hz in MAINS_HZ if (np.abs(_phases(hz, times_ns)) ** 2).mean() < _STANDS)
 
 
-def steady_levels(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64], mains_hz: float) -> NDArray[np.float64]:
-    """Return the level of each row without the bands of the other mains frequencies, which move from image to image.
-
-    ``row_levels``, float64 (n, H), is the mean level of each row of n images, 4 or more, at ``times_ns``, int64 (n,).
-    The bands of ``mains_hz`` stand still. Returns float64 (H,).
-    """
-    columns = [np.ones(len(times_ns))]
-    for other_hz in MAINS_HZ:
-        if other_hz != mains_hz:
-            phases = _phases(other_hz, times_ns)
-            columns += [phases.real, phases.imag]
-    return np.asarray(np.linalg.lstsq(np.stack(columns, axis=1), row_levels, rcond=None)[0][0])
-
-
-def standing_flicker(
-    with_bands: NDArray[np.float64], without: NDArray[np.float64], mains_hz: float
-) -> MainsFlicker | None:
-    """Return the flicker whose bands stand still in the images of one exposure time; None if there is none.
-
-    One exposure time does not separate bands from the scene. An exposure of whole periods of the lamp has no bands:
-    the quotient of both is the bands, and a smooth function of the level if the camera's response is not linear.
-    Decision: docs/decisions/0008.
-
-    ``with_bands``, float64 (H,), is the mean level of each row at the exposure time in question, ``without`` the same
-    at an exposure time of whole periods of the lamp.
-    """
-    if len(without) < _BLOCKS:
-        return None
-    one, other = _blocks(with_bands), _blocks(without)
-    lit = (one > 1.0) & (other > 1.0)
-    if lit.sum() < _BLOCKS / 2:
-        return None
-    quotient, y = np.log(one[lit] / other[lit]), _MIDDLES[lit]
-    response = np.stack([np.ones(len(y)), np.log(other[lit])], axis=1)
-    unexplained = _residual(response, quotient)[1]
-    best: tuple[float, float] = (0.0, 0.0)
-    for cycles in _STANDING_CYCLES:
-        waves = np.stack([np.cos(2 * np.pi * cycles * y), np.sin(2 * np.pi * cycles * y)], axis=1)
-        fitted, rest = _residual(np.hstack([response, waves]), quotient)
-        best = max(best, (1.0 - rest / max(unexplained, 1e-12), float(np.hypot(*fitted[-2:]))))
-    explained, depth = best
-    return MainsFlicker(mains_hz, depth) if depth >= MIN_DEPTH and explained >= _MIN_EXPLAINED else None
-
-
-_MIDDLES = (np.arange(_BLOCKS) + 0.5) / _BLOCKS
-
-
-def _blocks(row_levels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of blocks of rows, float64 (..., `_BLOCKS`)."""
-    height = row_levels.shape[-1]
-    usable = row_levels[..., : height - height % _BLOCKS]
-    return np.asarray(usable.reshape(*usable.shape[:-1], _BLOCKS, -1).mean(axis=-1))
-
-
 def _phases(mains_hz: float, times_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
     """Return the lamp's phase in each image as a complex number, without the mean, which is part of the scene."""
     phases = np.exp(-2j * np.pi * 2 * mains_hz * (times_ns - times_ns[0]) * 1e-9)
     return np.asarray(phases - phases.mean())
-
-
-def _residual(design: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the coefficients of a fit by least squares, and the mean square of its residuals."""
-    fitted = np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
-    return fitted, float(((values - design @ fitted) ** 2).mean())
-
-
-def green(image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return every second column of the green channel, uint8 (height, width / 2): enough for the levels of rows."""
-    return image_bgr[:, ::2, 1]
 
 
 def _flicker(
@@ -366,51 +274,22 @@ def _flicker(
 ) -> Iterator[Finding]:
     levels = evidence["mean_levels"]
     spread = (max(levels) - min(levels)) / max(levels)
-    lamp = mains_flicker(np.array([green(frame).mean(axis=1) for frame in frames]), times_ns)
-    if lamp is None and spread > MAX_FLICKER:
-        fix: SomeSteps = (
-            "Use a lamp that does not flicker, and keep daylight and shadows away, then",
-            Do.DOCTOR(),
-        )
-        yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
-        return
-    exposure_us = source.read_locks().exposure_us
-    if lamp is None:
-        standing = [hz for hz in standing_mains_hz(times_ns) if not _whole_periods(hz, exposure_us)]
-        if len(standing) == 1 and exposure_us is not None:
-            lamp = _standing_flicker(source, exposure_us, standing[0])
-        elif standing:
-            reason = "several mains frequencies are possible" if exposure_us else "its exposure time is not known"
-            yield fine("camera", FindingCode.STANDING_FLICKER_NOT_CHECKED, mains_hz=standing, reason=reason)
+    # Every second column of the green channel is enough for the levels of rows.
+    lamp = mains_flicker(np.array([frame[:, ::2, 1].mean(axis=1) for frame in frames]), times_ns)
+    exposure_us = source.read_locks().exposure_us or 1e4
     if lamp is not None:
-        fix = Do.SET_KEY(key="camera.exposure_us", value=f"{lamp.exposure_us(exposure_us or 1e4):g}")
+        fix: SomeSteps = _exposure_without_bands(lamp.mains_hz, exposure_us)
         yield warning("camera", FindingCode.MAINS_FLICKER, fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
+    elif spread > MAX_FLICKER:
+        fix = ("Use a lamp that does not flicker, and keep daylight and shadows away, then", Do.DOCTOR())
+        yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
+    else:
+        for hz in standing_mains_hz(times_ns):
+            if abs(whole_periods_us(hz, exposure_us) - exposure_us) > EXPOSURE_STEP_US:
+                steps = as_steps(_exposure_without_bands(hz, exposure_us))
+                parameters = {"mains_hz": hz}
+                yield Finding("camera", Severity.FINE, FindingCode.STANDING_FLICKER_NOT_CHECKED, parameters, steps)
 
 
-def _whole_periods(mains_hz: float, exposure_us: float | None) -> bool:
-    """Return whether the exposure has no bands."""
-    return exposure_us is not None and abs(whole_periods_us(mains_hz, exposure_us) - exposure_us) <= EXPOSURE_STEP_US
-
-
-def _standing_flicker(source: OpenCvCamera, exposure_us: float, mains_hz: float) -> MainsFlicker | None:
-    """Compare images of the exposure in question with images of an exposure without bands."""
-    images: list[NDArray[np.uint8]] = []
-    times_ns: list[int] = []
-    try:
-        for time_us in (exposure_us, whole_periods_us(mains_hz, exposure_us)):
-            after_ns = source.change_exposure(time_us)
-            for _ in range(PER_EXPOSURE):
-                frame = source.capture(after_ns)
-                after_ns = frame.exposed_ns + 1
-                images.append(green(frame.image_bgr))
-                times_ns.append(frame.exposed_ns)
-    finally:
-        source.change_exposure(exposure_us)
-    levels = np.stack(images)
-    usable = ((levels > DARK) & (levels < BRIGHT)).all(axis=0)  # the same pixels in all images
-    rows = (levels * usable).sum(axis=2) / np.maximum(usable.sum(axis=1), 1)
-    times = np.array(times_ns)
-    with_bands, without = (
-        steady_levels(rows[part], times[part], mains_hz) for part in (slice(PER_EXPOSURE), slice(PER_EXPOSURE, None))
-    )
-    return standing_flicker(with_bands, without, mains_hz)
+def _exposure_without_bands(mains_hz: float, exposure_us: float) -> NextStep:
+    return Do.SET_KEY(key="camera.exposure_us", value=f"{whole_periods_us(mains_hz, exposure_us):g}")

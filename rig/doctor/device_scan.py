@@ -3,7 +3,6 @@
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -26,7 +25,7 @@ from rig.doctor.bus_scan import (
     FoundImu,
     FoundServo,
     scan_imus,
-    scan_servos,
+    scan_rates,
     unusable_address,
     use_another_imu,
     without_echoes,
@@ -78,32 +77,19 @@ class DeviceScan:
     def candidates(self) -> dict[str, list[dict[Key, Any]]]:
         """The settings of each device found that the rig can use, by what it may be."""
         servos: list[dict[Key, Any]] = [
-            {
-                ("servo", "port"): port.stable or port.path,
-                ("servo", "baud"): found.baud,
-                ("servo", "id"): found.bus_id,
-                ("servo", "model"): found.model,
-            }
+            _keys("servo", port=port.stable or port.path, baud=found.baud, id=found.bus_id, model=found.model)
             for port, found in self.servos
         ]
         imus: list[dict[Key, Any]] = [
-            {
-                ("imu", "model"): found.driver,
-                ("imu", "bus"): _number_or(found.bus, found.bus.removeprefix("/dev/i2c-")),
-                ("imu", "address"): found.address,
-            }
+            _keys("imu", model=found.driver, bus=_number_or(found.bus, "/dev/i2c-"), address=found.address)
             for found in self.imus
         ]
         heads: list[dict[Key, Any]] = [
-            {
-                ("imu", "connection"): "head",
-                ("imu", "model"): model,
-                ("head", "port"): port.stable or port.path,
-            }
+            _keys("imu", connection="head", model=model) | _keys("head", port=port.stable or port.path)
             for port, model in self.heads
         ]
         cameras = [camera_settings(one) for one in self.cameras]
-        ribbons: list[dict[Key, Any]] = [{("camera", "source"): f"picamera2:{number}"} for number in self.ribbons]
+        ribbons: list[dict[Key, Any]] = [_keys("camera", source=f"picamera2:{number}") for number in self.ribbons]
         return {"servo": servos, "IMU": imus + heads, "camera": cameras + ribbons}
 
     @property
@@ -150,11 +136,8 @@ class DeviceScan:
                 yield warning("servo", FindingCode.NOTHING_ON_PORT, fix, port=port.path, name=port.name)
 
     def _servos(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
-        answered: list[BaudScan] = []
         with closing(context.computer.open_serial(port.path, BAUD_RATES[0])) as wire:
-            for rate in BAUD_RATES:
-                yield f"{port.path}: scanning at {rate} baud ..."
-                answered += scan_servos(wire, context.computer.clock, [rate])
+            answered = yield from scan_rates(wire, context.computer.clock, BAUD_RATES, port.path)
         for scan in without_echoes(answered, context.config.servo.baud):
             yield from self._found(port, scan)
         return any(scan.answered for scan in answered)
@@ -273,17 +256,21 @@ def camera_settings(found: FoundCamera) -> dict[Key, Any]:
 
     The mode is the offered one that is nearest to the default.
     """
-    number = Path(found.node.path).name.removeprefix("video")
-    keys: dict[Key, Any] = {("camera", "source"): found.node.stable or _number_or(found.node.path, number)}
+    settings: dict[str, Any] = {"source": found.node.stable or _number_or(found.node.path, "/dev/video")}
     usual = CameraConfig()
     mode = choose_mode(found.modes, usual.width, usual.height, usual.fps)
     if mode is not None and (mode.width, mode.height) != (usual.width, usual.height):
-        keys |= {("camera", "width"): mode.width, ("camera", "height"): mode.height}
+        settings |= {"width": mode.width, "height": mode.height}
     if mode is not None and 0 < mode.fps < 0.9 * usual.fps:
-        keys[("camera", "fps")] = round(mode.fps, 3)
-    return keys
+        settings["fps"] = round(mode.fps, 3)
+    return _keys("camera", **settings)
 
 
-def _number_or(path: str, number: str) -> int | str:
+def _keys(section: str, **values: Any) -> dict[Key, Any]:
+    return {(section, name): value for name, value in values.items()}
+
+
+def _number_or(path: str, beginning: str) -> int | str:
     """Return the number of a device file, or its path if it is not named by a number."""
+    number = path.removeprefix(beginning)
     return int(number) if number.isdigit() else path

@@ -56,9 +56,6 @@ class FindingCode(Enum):
     FREE_SPACE = "{free_gb:.1f} GB free for {path}: about {objects} more objects"
     NOT_WRITABLE = "{user} may not write to {path}"
     NETWORK_DISK = "{path} is on a network file system, where locks may fail"
-    PAUSE = "a pause of {wanted_ms:.0f} ms took {pause_ms:.1f} ms"
-    LONG_PAUSE = "a pause of {wanted_ms:.0f} ms took {pause_ms:.0f} ms: this computer is overloaded, or suspends"
-    TIME_JUMPED = "the civil time jumped by {jump_s:+.1f} s during the check"
     WRONG_DATE = "the date is wrong: {utc:%Y-%m-%d %H:%M} UTC: stored data would have a wrong date"
     NOT_SYNCHRONIZED = "{utc:%Y-%m-%d %H:%M} UTC, but no time server has been reached since this computer started"
     NO_TIME_SERVER = "{utc:%Y-%m-%d %H:%M} UTC, no time server that is known here"
@@ -124,10 +121,11 @@ class FindingCode(Enum):
     FEW_FRAMES = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second, not {fps:.3g}"
     MAINS_FLICKER = (
         "the lamps flicker with the mains ({mains_hz:.0f} Hz): bands of {depth:.0%} in the images; an exposure of "
-        "whole periods of the lamp has none"
+        "of whole periods of the lamp has none"
     )
     STANDING_FLICKER_NOT_CHECKED = (
-        "bands that stand still in the images ({mains_hz} Hz mains) are not checked: {reason}"
+        "bands of lamps at {mains_hz:.0f} Hz mains would stand still in the images, and are not checked; an exposure "
+        "of whole periods of the lamp has none"
     )
     FLICKER = "the light changes by {spread:.0%} within {seconds:.0f} s"
     VIEW_ACCEPTED = (
@@ -221,6 +219,19 @@ def warning(topic: str, code: FindingCode, fix: SomeSteps, /, **parameters: Any)
 
 def bad(topic: str, code: FindingCode, fix: SomeSteps, exit_code: int = 4, /, **parameters: Any) -> Finding:
     return Finding(topic, Severity.BAD, code, parameters, as_steps(fix), exit_code)
+
+
+def finding(
+    level: Severity, topic: str, code: FindingCode, fix: SomeSteps, exit_code: int = 4, /, **parameters: Any
+) -> Finding:
+    """Return a finding of a value that may be fine or not; without a problem there is nothing to fix."""
+    if level is Severity.FINE:
+        return fine(topic, code, **parameters)
+    return Finding(topic, level, code, parameters, as_steps(fix), exit_code * (level is Severity.BAD))
+
+
+def graded(*, bad: bool, warning: bool = False) -> Severity:
+    return Severity.BAD if bad else Severity.WARNING if warning else Severity.FINE
 
 
 def of_error(topic: str, error: RigError, fix: SomeSteps = ()) -> Finding:

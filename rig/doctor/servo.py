@@ -18,9 +18,9 @@ from rig.devices.dynamixel.registers import (
 )
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
-from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, bad, finding, fine, graded, of_error, warning
 
 READS = 100  # finds one bad reading in fifty; takes half a second at 57,600 bit/s
 REPEATED = 2  # number of repeated readings on a good bus
@@ -76,14 +76,11 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
 def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding | str]:
     """Scan the other baud rates, because the configured servo does not answer."""
     config = context.config.servo
-    answered: list[BaudScan] = []
-    for rate in (config.baud, *(rate for rate in BAUD_RATES if rate != config.baud)):
-        yield f"{config.port}: no servo at id {config.id}; scanning at {rate} baud ..."
-        for scan in scan_servos(wire, context.computer.clock, [rate]):
-            if scan.duplicate_ids:
-                yield duplicate_id(config.port, scan)
-                return
-            answered.append(scan)
+    rates = (config.baud, *(rate for rate in BAUD_RATES if rate != config.baud))
+    answered = yield from scan_rates(wire, context.computer.clock, rates, config.port)
+    if answered and answered[-1].duplicate_ids:
+        yield duplicate_id(config.port, answered[-1])
+        return
     there = [found for scan in without_echoes(answered, config.baud) for found in scan.servos]
     if not there:
         yield bad("servo", FindingCode.NO_SERVO, (POWER, Do.DOCTOR()), **_place(config))
@@ -164,20 +161,14 @@ def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
         values = {"voltage_v": state.voltage_v, "temperature_c": state.temperature_c}
         yield bad("servo", FindingCode.IMPOSSIBLE_VALUES, fix, **values)
         return
-    margin, fix = safety.voltage_margin_v, "Check the power supply and its plug"
+    beyond_v = max(low - state.voltage_v, state.voltage_v - high)
+    level = graded(bad=beyond_v > 0, warning=beyond_v > -safety.voltage_margin_v)
     supply = {"voltage_v": state.voltage_v, "low_v": low, "high_v": high}
-    if not low <= state.voltage_v <= high:
-        yield bad("servo", FindingCode.SUPPLY, fix, **supply)
-    elif not low + margin <= state.voltage_v <= high - margin:
-        yield warning("servo", FindingCode.SUPPLY, fix, **supply)
-    else:
-        yield fine("servo", FindingCode.SUPPLY, **supply)
+    yield finding(level, "servo", FindingCode.SUPPLY, "Check the power supply and its plug", **supply)
+    level = graded(bad=state.temperature_c >= limits.temperature_c - safety.temperature_margin_c)
     temperature = {"temperature_c": state.temperature_c, "limit_c": limits.temperature_c}
-    if state.temperature_c >= limits.temperature_c - safety.temperature_margin_c:
-        fix = "Let it cool, and find out why the table is hard to rotate"
-        yield bad("servo", FindingCode.TEMPERATURE, fix, **temperature)
-    else:
-        yield fine("servo", FindingCode.TEMPERATURE, **temperature)
+    fix = "Let it cool, and find out why the table is hard to rotate"
+    yield finding(level, "servo", FindingCode.TEMPERATURE, fix, **temperature)
 
 
 def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Iterator[Finding]:

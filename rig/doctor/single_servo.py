@@ -1,6 +1,6 @@
 """Change a servo's id and baud rate: only if it is alone on its bus, with the torque off, and verified afterwards."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from rig.core.next_steps import Do
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import ControlTable, control_table, require_driven
-from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates, without_echoes
 from rig.doctor.context import DoctorContext
 
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
@@ -128,19 +128,24 @@ def single_servo(context: DoctorContext, progress: Callable[[str], None] = lambd
         wire.close()
 
 
+def _told(scan: Generator[str, None, list[BaudScan]], progress: Callable[[str], None]) -> list[BaudScan]:
+    """Return what a scan returns, and report its texts."""
+    while True:
+        try:
+            progress(next(scan))
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]
+
+
 def _find_only_servo(context: DoctorContext, wire: SerialConnection, progress: Callable[[str], None]) -> FoundServo:
     """Scan all baud rates: a second servo at another rate would answer as soon as the rates are equal."""
-    scans: list[BaudScan] = []
-    for rate in BAUD_RATES:
-        progress(f"{context.config.servo.port}: asking at {rate} baud ...")
-        for scan in scan_servos(wire, context.computer.clock, [rate]):
-            scans.append(scan)
-            if scan.duplicate_ids:
-                raise SeveralServos(
-                    f"Two servos answer at once to id {', '.join(map(str, scan.duplicate_ids))} at {rate} baud.",
-                    next_step="Unplug all other servos, then try again.",
-                    evidence={"ids": list(scan.duplicate_ids), "baud": rate},
-                )
+    scans = _told(scan_rates(wire, context.computer.clock, BAUD_RATES, context.config.servo.port), progress)
+    if scans and (ids := scans[-1].duplicate_ids):
+        raise SeveralServos(
+            f"Two servos answer at once to id {', '.join(map(str, ids))} at {scans[-1].baud} baud.",
+            next_step="Unplug all other servos, then try again.",
+            evidence={"ids": list(ids), "baud": scans[-1].baud},
+        )
     found = [servo for scan in without_echoes(scans, context.config.servo.baud) for servo in scan.servos]
     if not found:
         raise DeviceNotFound(

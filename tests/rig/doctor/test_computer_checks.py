@@ -2,7 +2,7 @@
 
 import os
 from contextlib import contextmanager
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 
 import pytest
 
@@ -212,23 +212,3 @@ def test_unsynchronised_clock_is_a_warning_and_wrong_date_is_bad():
         bench.context.computer.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
         (wrong,) = [f for f in bench.findings("clock") if f.level is Severity.BAD]
         assert wrong.code is FindingCode.WRONG_DATE
-
-
-def test_time_jump_and_long_pause_are_reported():
-    class Bad(VirtualClock):
-        """Sleeps too long, and its civil time jumps meanwhile."""
-
-        jump = timedelta()
-
-        def sleep(self, seconds):
-            super().sleep(seconds + 1.0)
-            self.jump = timedelta(hours=1)
-
-        def utc(self):
-            return super().utc() + self.jump
-
-    with unopened() as bench:
-        bench.context.computer.clock = Bad()
-        problems = {f.code: f.parameters for f in bench.findings("clock")}
-        assert round(problems[FindingCode.LONG_PAUSE]["pause_ms"]) == 1020
-        assert problems[FindingCode.TIME_JUMPED]["jump_s"] == pytest.approx(3600, abs=1)

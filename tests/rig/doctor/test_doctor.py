@@ -48,7 +48,7 @@ def test_empty_computer_reports_each_missing_device():
         bad = {f.topic for f in findings if f.level is Severity.BAD}
         assert bad == {"port", "servo", "imu", "camera"}
         assert all(f.fix for f in findings if f.level is not Severity.FINE)
-        assert {f.topic for f in findings if f.level is Severity.FINE} >= {"bench", "disk", "clock", "catalog"}
+        assert {f.topic for f in findings if f.level is Severity.FINE} >= {"bench", "disk", "catalog"}
 
 
 # -- the servo --------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pytest
 
 import hbr
 from hbr.core.angles import wrap180
-from rig.catalog import Catalog, derived
+from rig.catalog import Catalog
 from rig.catalog.describing import FEWEST_VIEWS, described
 from rig.core.errors import (
     CameraSettingsDiffer,
