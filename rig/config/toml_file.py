@@ -1,8 +1,8 @@
 """Edits single values of `rig.toml`; comments, order and spacing stay.
 
-`tomllib` parses; this module only finds the position of a value in the text. Each edit is parsed again and rejected if
-it changed anything else. tomlkit is not used, because it drops the comments inside a value of several lines, does not
-put a new key below its commented default, and reports no line numbers.
+`tomllib` parses; this module only finds the lines of a value, also by `tomllib`. Each edit is parsed again and rejected
+if it changed anything else. tomlkit is not used, because it drops the comments inside a value of several lines, does
+not put a new key below its commented default, and reports no line numbers.
 """
 
 import difflib
@@ -12,6 +12,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,60 +30,13 @@ MAX_DOTS: Final = 1000
 MAX_INTEGER: Final = 2**63
 """TOML 1.0, Integer: 64-bit signed."""
 
+MAX_LINES: Final = 100
+"""Of a value: each number of lines up to its end is tried."""
+
 NONE: Final = "none"
 """The text that clears an optional key; TOML has no null."""
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-
-
-@dataclass(frozen=True, slots=True)
-class Statement:
-    """A ``key = value`` or a ``[table]`` of a document; offsets count characters.
-
-    ``key`` is the whole path, ``table`` the path of the table above it. ``start`` is the start of the line, ``value``
-    the start of the value (None for a header), ``end`` the end of the value or header. ``comments`` are those inside a
-    value of several lines.
-    """
-
-    key: Key
-    table: Key
-    line: int
-    start: int
-    value: int | None
-    end: int
-    comments: tuple[str, ...] = ()
-
-
-def statements(text: str) -> Iterator[Statement]:
-    """Yield the statements of a valid document in order, except those inside arrays of tables."""
-    position, addressable = 0, True
-    table: Key = ()
-    while position < len(text):
-        start = position
-        while position < len(text) and text[position] in " \t":
-            position += 1
-        line = text.count("\n", 0, start) + 1
-        if position < len(text) and text[position] not in "#\r\n":
-            if text[position] == "[":
-                double = text.startswith("[[", position)
-                content = position + 1 + double
-                position = _skip(text, content, "]")
-                addressable = not double
-                table = _parts(text[content:position])
-                position += 1 + double
-                if addressable:
-                    yield Statement(table, table, line, start, None, position)
-            else:
-                begin = position
-                position = _skip(text, position, "=")
-                key = table + _parts(text[begin:position])
-                value = position + 1
-                while text[value] in " \t":
-                    value += 1
-                position, comments = _value_end(text, value)
-                if addressable:
-                    yield Statement(key, table, line, start, value, position, comments)
-        position = _line_end(text, position)
 
 
 def loads(text: str) -> dict[str, Any]:
@@ -109,8 +63,8 @@ def loads(text: str) -> dict[str, Any]:
 
 
 def line_numbers(text: str) -> dict[Key, int]:
-    """Return the line of each key and table of a valid document."""
-    return {statement.key: statement.line for statement in statements(text)}
+    """Return the line of each key and table of a valid document. Raises `ValueError`: see `MAX_LINES`."""
+    return {statement.key: statement.begin + 1 for statement in _statements(StringIO(text).readlines())}
 
 
 def with_values(text: str, changes: Mapping[Key, Any]) -> str:
@@ -135,10 +89,10 @@ def with_values(text: str, changes: Mapping[Key, Any]) -> str:
         if key[-1] in here and _same(here[key[-1]], value):
             continue
         here[key[-1]] = value
-        edited = _edited(text, key, value, before)
         try:
+            edited = _edited(text, key, value, before)
             after = tomllib.loads(edited)
-        except tomllib.TOMLDecodeError as error:
+        except ValueError as error:
             raise _cannot_edit(key, value, str(error)) from error
         if not _same(after, expected):
             raise _cannot_edit(key, value, "it would change something else as well")
@@ -205,127 +159,135 @@ def stated(key: Key, value: Any) -> str:
 # -- positions ---------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True)
+class _Statement:
+    """A ``key = value`` or a ``[table]`` of a document: its lines from ``begin`` to before ``end``.
+
+    ``key`` is the whole path, ``table`` the path of the table above it.
+    """
+
+    key: Key
+    table: Key
+    begin: int
+    end: int
+    is_header: bool = False
+
+
+def _statements(lines: list[str]) -> Iterator[_Statement]:
+    """Yield the statements of a valid document in order, except those inside arrays of tables."""
+    table: Key | None = ()
+    at = 0
+    while at < len(lines):
+        begin, line = at, lines[at].strip()
+        at += 1
+        if line.startswith("[["):
+            table = None
+        elif line.startswith("["):
+            table = _path(tomllib.loads(line))
+            yield _Statement(table, table, begin, at, is_header=True)
+        elif line and not line.startswith("#"):
+            # The lines of a value are those that tomllib can parse.
+            while _parsed("".join(lines[begin:at])) is None:
+                at += 1
+                if at - begin > MAX_LINES:
+                    raise ValueError(f"the value in line {begin + 1} has more than {MAX_LINES} lines")
+            if table is not None:
+                yield _Statement((*table, *_key_of(lines[begin])[0]), table, begin, at)
+
+
+def _parsed(text: str) -> dict[str, Any] | None:
+    """Return the values of a part of a document; None if it is not complete."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return None
+
+
+def _path(values: Any) -> Key:
+    """Return the only path in the values of a header or a key."""
+    parts = []
+    while isinstance(values, dict) and values:
+        ((part, values),) = values.items()
+        parts.append(part)
+    return tuple(parts)
+
+
+def _key_of(line: str) -> tuple[Key, str]:
+    """Return the path of the key of a line, and the text up to its equals sign, which is not in a quoted key."""
+    for sign in re.finditer("=", line):
+        if (values := _parsed(f"{line[: sign.start()]}= 0")) is not None:
+            return _path(values), line[: sign.end()]
+    raise AssertionError(line)  # the document is valid
+
+
+def _behind_value(line: str) -> str:
+    """Return what follows the value of a line: its comment and its end."""
+    ends = (hash_sign.start() for hash_sign in re.finditer("#", line))
+    code = next((line[:end] for end in ends if _parsed(line[:end]) is not None), line)
+    return line[len(code.rstrip()) :]
+
+
 def _edited(text: str, key: Key, value: Any, values: Mapping[str, Any]) -> str:
-    known = list(statements(text))
-    newline = "\r\n" if "\r\n" in text else "\n"
-    for statement in known:
-        if statement.value is not None and statement.key == key[: len(statement.key)]:
-            inline = _merged(values, statement.key, key[len(statement.key) :], value)
-            kept = "".join(f"{comment}{newline}" for comment in statement.comments)
-            before = text[: statement.start] + kept + text[statement.start : statement.value]
-            return before + stated(statement.key, inline) + text[statement.end :]
-    siblings = [s for s in known if s.value is not None and s.key[:-1] == key[:-1]]
-    if siblings:
-        last = siblings[-1]
-        indent = text[last.start : last.start + len(text[last.start :]) - len(text[last.start :].lstrip(" \t"))]
-        line = f"{indent}{_written(key[len(last.table) :])} = {stated(key, value)}{newline}"
-        return _inserted(text, _default_line_end(text, last, key, known) or _line_end(text, last.end), line, newline)
+    lines, newline = StringIO(text).readlines(), "\r\n" if "\r\n" in text else "\n"
+    known = list(_statements(lines))
+    # Replace the value, or that of the inline table around it.
+    for one in (one for one in known if not one.is_header and one.key == key[: len(one.key)]):
+        _, before = _key_of(lines[one.begin])
+        new = f"{before} {stated(one.key, _merged(values, one.key, key[len(one.key) :], value))}"
+        if one.end - one.begin == 1:
+            lines[one.begin] = new + _behind_value(lines[one.begin])
+        else:  # the old lines stay as comments, because there may be comments in them
+            old = [f"#{line.rstrip()}{newline}" for line in lines[one.begin : one.end]]
+            lines[one.begin : one.end] = [*old, new + newline]
+        return "".join(lines)
+    # Or insert the key: below its commented default, below its last sibling, or below the header of its table.
+    siblings = [one for one in known if not one.is_header and one.key[:-1] == key[:-1]]
+    near = (siblings or [one for one in known if one.is_header and one.key == key[:-1]])[-1:]
+    if near:
+        first = lines[near[0].begin]
+        indent = first[: len(first) - len(first.lstrip(" \t"))] if siblings else ""
+        at = _default_line(lines, near[0], key, known) or near[0].end
+        new = f"{indent}{_written(key[len(near[0].table) :])} = {stated(key, value)}{newline}"
+        return _inserted(lines, at, newline, new)
     line = f"{_written(key[-1:])} = {stated(key, value)}{newline}"
-    headers = [s for s in known if s.value is None and s.key == key[:-1]]
-    if headers:
-        header = headers[-1]
-        end = _default_line_end(text, header, key, known) or _line_end(text, header.end)
-        return _inserted(text, end, line, newline)
-    if len(key) == 1:
-        first = next((s.start for s in known if s.value is None), len(text))
-        return _inserted(text, _above_comments(text, first), line + newline * (first < len(text)), newline)
-    return _inserted(text, len(text), f"{newline * bool(text.strip())}[{_written(key[:-1])}]{newline}{line}", newline)
+    if len(key) > 1:
+        return _inserted(
+            lines, len(lines), newline, *[newline] * bool(text.strip()), f"[{_written(key[:-1])}]{newline}", line
+        )
+    # The first key without a table: above the first table and its comments.
+    at = next((one.begin for one in known if one.is_header), len(lines))
+    gap = [newline] * (at < len(lines))
+    while at and lines[at - 1].lstrip(" \t").startswith("#"):
+        at -= 1
+    return _inserted(lines, at, newline, line, *gap)
 
 
 def _merged(values: Mapping[str, Any], table: Key, rest: Key, value: Any) -> Any:
     """Return the inline table ``table`` with ``rest`` in it set to ``value``; ``value`` if ``rest`` is empty."""
+    if not rest:
+        return value
     inline: Any = values
     for part in table:
         inline = inline[part]
-    if not rest:
-        return value
-    inline = deepcopy(inline)
-    here = inline
+    inline = here = deepcopy(inline)
     for part in rest[:-1]:
         here = here.setdefault(part, {})
     here[rest[-1]] = value
     return inline
 
 
-def _default_line_end(text: str, near: Statement, key: Key, known: Iterable[Statement]) -> int | None:
-    """Return the end of the line with the key's commented default (``# key = default``) in the same table, if any."""
-    headers = [s for s in known if s.value is None]
-    begin = max((s.end for s in headers if s.start <= near.start), default=0)
-    end = min((s.start for s in headers if s.start > near.start), default=len(text))
-    found = re.compile(rf"^[ \t]*#[ \t]*{re.escape(key[-1])}[ \t]*=.*$", re.MULTILINE).search(text, begin, end)
-    return _line_end(text, found.end()) if found else None
+def _default_line(lines: list[str], near: _Statement, key: Key, known: Iterable[_Statement]) -> int | None:
+    """Return the place below the key's commented default (``# key = default``) in the same table, if any."""
+    headers = [one for one in known if one.is_header]
+    begin = max((one.end for one in headers if one.begin <= near.begin), default=0)
+    end = min((one.begin for one in headers if one.begin > near.begin), default=len(lines))
+    default = re.compile(rf"[ \t]*#[ \t]*{re.escape(key[-1])}[ \t]*=")
+    return next((at + 1 for at in range(begin, end) if default.match(lines[at])), None)
 
 
-def _above_comments(text: str, position: int) -> int:
-    """Return the start of the comment lines directly above ``position``."""
-    while position and text[text.rfind("\n", 0, position - 1) + 1 : position].lstrip(" \t").startswith("#"):
-        position = text.rfind("\n", 0, position - 1) + 1
-    return position
-
-
-def _inserted(text: str, position: int, lines: str, newline: str) -> str:
-    before = text[:position]
-    return before + (newline if before and not before.endswith("\n") else "") + lines + text[position:]
-
-
-def _line_end(text: str, position: int) -> int:
-    end = text.find("\n", position)
-    return len(text) if end < 0 else end + 1
-
-
-def _skip(text: str, position: int, wanted: str) -> int:
-    """Return the position of ``wanted`` outside of quotes."""
-    while text[position] != wanted:
-        position = _string_end(text, position) if text[position] in "\"'" else position + 1
-    return position
-
-
-def _value_end(text: str, position: int) -> tuple[int, tuple[str, ...]]:
-    """Return the end of the value that begins at ``position``, and the comments inside it."""
-    depth, end = 0, position
-    comments = []
-    while position < len(text):
-        character = text[position]
-        if character == "#":
-            if not depth:
-                break
-            line_end = _line_end(text, position)
-            comments.append(text[position:line_end].rstrip())
-            position = line_end
-            continue
-        if character in "\r\n" and not depth:
-            break
-        if character in "\"'":
-            position = end = _string_end(text, position)
-            continue
-        depth += (character in "[{") - (character in "]}")
-        position += 1
-        if character not in " \t":
-            end = position
-    return end, tuple(comments)
-
-
-def _string_end(text: str, position: int) -> int:
-    quote = text[position]
-    if text.startswith(quote * 3, position):
-        quote *= 3
-    end = position + len(quote)
-    while not text.startswith(quote, end):
-        end += 2 if text[end] == "\\" and quote[0] == '"' else 1
-    end += len(quote)
-    while len(quote) == 3 and text.startswith(quote[0], end):  # up to two more quotes belong to the string
-        end += 1
-    return end
-
-
-def _parts(dotted: str) -> Key:
-    """Return the parts of a dotted key, which may be quoted."""
-    here: Any = tomllib.loads(f"{dotted.strip()} = 0")
-    parts = []
-    while isinstance(here, dict):
-        ((part, here),) = here.items()
-        parts.append(part)
-    return tuple(parts)
+def _inserted(lines: list[str], at: int, newline: str, *new: str) -> str:
+    before = "".join(lines[:at])
+    return before + newline * (bool(before) and not before.endswith("\n")) + "".join((*new, *lines[at:]))
 
 
 def _written(key: Key) -> str:

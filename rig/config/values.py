@@ -66,13 +66,13 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, sear
         text = read_text(source)
         try:
             values = loads(text)
+            places = {key: f"line {line}" for key, line in line_numbers(text).items()}
         except ValueError as error:
             raise ConfigError(
                 f"{source} is not a TOML file.",
                 next_step="Fix this line.",
                 evidence={"reason": str(error), **_line_named(text, str(error))},
             ) from error
-        places = {key: f"line {line}" for key, line in line_numbers(text).items()}
         for key in _PATHS:
             _resolve(values, key, source.resolve().parent)
     for override in overrides:

@@ -52,9 +52,16 @@ def test_new_keys_and_tables_are_inserted_in_their_places():
     assert edited.endswith('\n[imu]\nbus = "/dev/i2c-3"\n')
 
 
-def test_comments_inside_a_multiline_value_move_above_it():
+def test_value_of_several_lines_stays_as_a_comment():
     edited = with_values(BY_HAND, {("table", "limits_deg"): [-720, 720]})
-    assert "# the cable\n# taut here\nlimits_deg = [-720, 720]\n" in edited
+    old = "#limits_deg = [ # the cable\n#    -400,      # taut here\n#    400,\n#]\n"
+    assert f"{old}limits_deg = [-720, 720]\n" in edited
+
+
+def test_value_of_too_many_lines_is_rejected():
+    with pytest.raises(ConfigError, match=r"Cannot set servo\.id") as caught:
+        with_values("a = [\n" + "1,\n" * 200 + "]\n", {("servo", "id"): 2})
+    assert "more than 100 lines" in caught.value.evidence["reason"]
 
 
 def test_inline_table_keeps_its_other_values():
