@@ -18,6 +18,7 @@ from pydantic import ConfigDict, Discriminator, Field, GetPydanticSchema, TypeAd
 from pydantic_core import core_schema, from_json, to_json
 
 from hbr import Outcome, StopDecision, StopReason
+from rig.core.phrases import Worded
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
@@ -29,19 +30,31 @@ Image = Annotated[NDArray[np.uint8], NO_JSON, Field(exclude=True, default=np.emp
 """The image of an event. It is no part of the JSON; an event that is read has an empty one."""
 
 
-class NoteCode(StrEnum):
-    """The subjects of notes; `rig.events.wording.note_words` has their sentences."""
+class NoteCode(Worded):
+    """The subjects of notes."""
 
-    MIXED_EMPTY_TABLE = "mixed-empty-table"
-    ENROLLED_WITHOUT_EMPTY_TABLE = "enrolled-without-empty-table"
-    EMPTY_TABLE_DOUBTED = "empty-table-doubted"
-    EMPTY_TABLE_MISSING = "empty-table-missing"
-    EMPTY_TABLE_OF_ENROLLMENT = "empty-table-of-enrollment"
-    EMPTY_TABLE_CHANGED = "empty-table-changed"
-    TABLE_DIFFERS = "table-differs"
-    NOT_RECORDED = "not-recorded"
-    NOT_COMPARED = "not-compared"
-    LOCAL_COPY = "local-copy"
+    MIXED_EMPTY_TABLE = (
+        "mixed-empty-table",
+        "{objects} {were} enrolled {how} an empty-table image, unlike the other objects, and such views compare badly",
+    )
+    ENROLLED_WITHOUT_EMPTY_TABLE = (
+        "enrolled-without-empty-table",
+        "most objects were enrolled without an empty-table image, so the search does not use it",
+    )
+    EMPTY_TABLE_DOUBTED = "empty-table-doubted", "the empty-table image may be outdated ({problems})"
+    EMPTY_TABLE_MISSING = "empty-table-missing", "the search has no empty-table image ({problems})"
+    EMPTY_TABLE_OF_ENROLLMENT = (
+        "empty-table-of-enrollment",
+        "the empty-table image of the enrollment is used ({problems})",
+    )
+    EMPTY_TABLE_CHANGED = "empty-table-changed", "the bench no longer looks like its empty-table image: {problems}"
+    TABLE_DIFFERS = (
+        "table-differs",
+        "the table does not look as it did at {taken_utc}; an object that is round may be on it",
+    )
+    NOT_RECORDED = "not-recorded", "the answer is not recorded: {what}"
+    NOT_COMPARED = "not-compared", "the leading candidates are not compared pixel by pixel: {what}"
+    LOCAL_COPY = "local-copy", "the server of the catalog cannot be used; this uses the copy of {copied_utc}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,26 +67,29 @@ class Note:
     """Numbers and names for the text of the note."""
 
 
-class RotationReason(StrEnum):
+class RotationReason(Worded):
     """Why a strategy chose a rotation."""
 
-    FIRST_STEP = "first-step"
+    FIRST_STEP = "first-step", "the first rotation is fixed"
     LESS_SIMILAR_SIDE = "less-similar-side"
-    ONE_CANDIDATE = "one-candidate"
+    ONE_CANDIDATE = "one-candidate", "there is no second candidate to compare with, so a new side is viewed"
     SEPARATES_CANDIDATES = "separates-candidates"
-    NEW_SIDE = "new-side"
-    SEVERAL_POSES = "several-poses"
-    EVEN_STEPS = "even-steps"
-    RANDOM = "random"
-    LEAST_RISK = "least-risk"
+    NEW_SIDE = "new-side", "no second object is likely, so a new side is viewed"
+    SEVERAL_POSES = "several-poses", "the leading candidate fits in several poses, so a new side is viewed"
+    EVEN_STEPS = "even-steps", "the views are taken in even steps"
+    RANDOM = "random", "the rotation is random"
+    LEAST_RISK = (
+        "least-risk",
+        "the expected risk of a wrong object is least there, or hardly more, and the side is new",
+    )
     CUSTOM = "custom"
 
 
-class WaitReason(StrEnum):
+class WaitReason(Worded):
     """What `rig identify --watch` waits for."""
 
-    FIRST_OBJECT = "first-object"
-    NEXT_OBJECT = "next-object"
+    FIRST_OBJECT = "first-object", "the first object, on the empty table"
+    NEXT_OBJECT = "next-object", "the next object"
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,12 +379,12 @@ class Enrolled:
     """Time since the enrollment started or was resumed, by the clock of the bench."""
 
 
-class SkipReason(StrEnum):
+class SkipReason(Worded):
     """Why an object of a tray is skipped."""
 
-    ALREADY_ENROLLED = "already_enrolled"
-    OPERATOR = "operator"
-    ERROR = "error"
+    ALREADY_ENROLLED = "already_enrolled", "it is already enrolled"
+    OPERATOR = "operator", "as the operator asked"
+    ERROR = "error", "because of error {}"
 
 
 @dataclass(frozen=True, slots=True)

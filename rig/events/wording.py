@@ -1,47 +1,188 @@
-"""Steps and answers of a search, and notes of a plan, in words: the same on the terminal and in the report."""
+"""The events of a plan in words: a line for each, and its parts, for terminals, pages, logs and reports."""
 
 from collections.abc import Sequence
 from math import ceil, nan
-from typing import Any, Final
+from typing import Final
 
 from hbr import Outcome, StopDecision, StopReason
-from rig.core.next_steps import Do, NextSteps, steps_from_json
+from rig.core.next_steps import Do, NextStep, NextSteps, in_words, steps_from_json
 from rig.core.phrases import (
     angle_range,
     angle_words,
+    azimuth_words,
     counted,
     distinct,
+    duration_words,
+    filled,
     joined,
+    percent,
     percent_words,
     sentence,
     signed,
 )
 from rig.events.events import (
+    Accepted,
     Candidate,
     Decided,
+    EmptyTableImage,
+    Enrolled,
+    Event,
+    Failed,
+    FrameUsed,
     Identified,
+    Item,
     Moved,
     Note,
     NoteCode,
     ObjectChanged,
     Ranked,
+    Recorded,
+    Rejected,
     RotationReason,
     ScanStarted,
     SimilarObject,
     SimilarObjects,
+    Started,
     Unwinding,
     Verified,
-    WaitReason,
+    Waiting,
+    Warned,
 )
 from rig.motion.scan_speed import SpeedLimit
+from rig.views.capture import rejection_text
+from rig.views.description import BENCH_DESCRIPTOR
 from rig.views.table_problems import problem_text
 
 NOT_ENROLLED: Final = "not enrolled"
 """What the object on the table may be, beside the candidates."""
-NAMED = 5
+SHOWN: Final = 3
+"""Candidates in the line of a ranking."""
+NAMED: Final = 5
 """Objects that an ambiguous answer names."""
-ARCS_NAMED = 3
+ARCS_NAMED: Final = 3
 """Ranges of azimuth that are named."""
+_ENOUGH: Final = {
+    Outcome.CONTINUE: "",
+    Outcome.FOUND: ", enough to end the search",
+    Outcome.UNKNOWN: ", not enrolled",
+    Outcome.AMBIGUOUS: ", ambiguous",
+}
+
+
+def next_steps(event: Event) -> NextSteps:
+    """Return what the operator should do about an event; empty if nothing."""
+    match event:
+        case Started():
+            found: list[str | NextStep] = []
+            for note in event.notes:
+                found += (step for step in note_steps(note) if step not in found)
+            return tuple(found)
+        case Warned():
+            return note_steps(event.note)
+        case Failed():
+            return steps_from_json(event.steps)
+        case _:
+            return ()
+
+
+def line(event: Event) -> str:
+    """Return the text of an event for a terminal; empty if it has none."""
+    match event:
+        case Started():
+            paper = " (the paper's AHBR by CEDD: --strategy ahbr)" if event.descriptor == BENCH_DESCRIPTOR else ""
+            method = [f"{_method(event)}{paper}"] if event.strategy else []
+            notes = [(f"Note: {note_words(note)}.", in_words(note_steps(note))) for note in event.notes]
+            return "\n".join([*method, *(" ".join(filter(None, note)) for note in notes)])
+        case Waiting():
+            return f"{page_line(event)[:-1]}; Ctrl+C ends."
+        case Warned() | Failed():
+            return f"{page_line(event)}\nNext step: {in_words(next_steps(event))}"
+        case _:
+            return page_line(event)
+
+
+def _method(event: Started) -> str:
+    return f"Method: {event.strategy}, by {event.descriptor}"
+
+
+def page_line(event: Event) -> str:
+    """Return the text of an event for a page or a file, which show its next steps in their own way."""
+    match event:
+        case Started():
+            method = [_method(event)] if event.strategy else []
+            return "\n".join([*method, *(f"Note: {note_words(note)}." for note in event.notes)])
+        case Moved():
+            encoder, asked = (angle_words(angle, 2) for angle in (event.encoder_deg, event.commanded_deg))
+            return f"  table at {encoder} (asked {asked}): {move_words(event)}"
+        case ScanStarted():
+            return f"  {scan_words(event)}"
+        case Unwinding():
+            return f"  {unwinding_words(event)}"
+        case Rejected():
+            texts = "; ".join(rejection_text(reason, event.evidence) for reason in event.reasons)
+            return f"view {event.index + 1}, attempt {event.attempt}: rejected, {texts}"
+        case Accepted():
+            return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
+        case Ranked():
+            leaders = [_leader(one) for one in event.candidates[:SHOWN]]
+            if event.decision is not None:
+                leaders.append(f"{NOT_ENROLLED} ({percent_words(event.decision.not_enrolled)})")
+            return f"  candidates: {', '.join(leaders)} (margin {signed(event.margin, 3)})"
+        case FrameUsed():
+            return f"  {_frame_words(event)}"
+        case ObjectChanged():
+            return f"  {change_words(event)}"
+        case Decided():
+            return f"  {decision_words(event)} The table rotates to {angle_words(event.target_deg)}."
+        case Enrolled():
+            retakes = f", {counted(event.retakes, 'rejected image')}" if event.retakes else ""
+            took = duration_words(event.seconds)
+            return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
+        case Verified():
+            return f"  {sentence(verification_words(event))}"
+        case Identified():
+            least = "" if event.min_score is None else f" (unknown below {event.min_score:.3f})"
+            numbers = (
+                f"Score {event.score:.3f} per view{least}, "
+                f"margin {signed(event.margin, 3)}, {event.travelled_deg:.0f}° of rotation, "
+                f"{duration_words(event.seconds)}."
+            )
+            return "\n  ".join([*answer_lines(event), numbers])
+        case Item():
+            if event.reason is None:
+                return ""
+            why = filled(event.reason.words, event.error_code)
+            return f"{event.number} of {event.of}  {event.name}: skipped, {why}"
+        case SimilarObjects():
+            return "\n".join(f"  {words}" for words in similar_objects_words(event))
+        case EmptyTableImage():
+            share = "" if event.turning_share is None else f", {percent(event.turning_share)} rotates with the table"
+            each = "" if event.images == 1 else f"{event.images} azimuths, each "
+            return f"Empty-table image: {each}{event.width} × {event.height} pixels{share}"
+        case Warned():
+            return f"Warning: {note_words(event.note)}."
+        case Waiting():
+            return f"Waiting for {event.reason.words}."
+        case Recorded():
+            return f"Recorded as result {event.result}{f', sample {event.sample}' if event.sample else ''}."
+        case Failed():
+            return f"Error {event.code} ({event.error}): {event.what}"
+
+
+def _leader(one: Candidate) -> str:
+    share = share_words(one)
+    return f"{one.name} {one.score:.3f}{f' ({share})' if share else ''} at {azimuth_words(one.pose_deg)}°"
+
+
+def _frame_words(used: FrameUsed) -> str:
+    """Return the state of a search in motion after a frame, in words."""
+    best = f"{used.name} {percent_words(used.probability)}{_ENOUGH[used.outcome]}"
+    where = f"azimuth {azimuth_words(used.azimuth_deg)}°, {used.seconds:.1f} s"
+    rejected = f" ({counted(used.rejected, 'frame')} rejected)" if used.rejected else ""
+    return f"in motion: {best}; view {used.index + 1}, {where}{rejected}"
+
+
+# -- the parts of the lines --------------------------------------------------------------------------------------------
 
 
 def decision_words(decided: Decided) -> str:
@@ -55,8 +196,6 @@ def decision_words(decided: Decided) -> str:
 def _rotation_words(decided: Decided) -> str:
     """Return why a rotation was chosen."""
     match decided.reason:
-        case RotationReason.FIRST_STEP:
-            return "the first rotation is fixed"
         case RotationReason.LESS_SIMILAR_SIDE if decided.s_left is not None and decided.s_right is not None:
             return _side_words(decided.side, decided.s_left, decided.s_right, len(decided.candidates))
         case RotationReason.SEPARATES_CANDIDATES if decided.weighed is not None and decided.weighed.similarity:
@@ -69,20 +208,8 @@ def _rotation_words(decided: Decided) -> str:
             )
         case RotationReason.SEPARATES_CANDIDATES if len(decided.candidates) >= 2:
             return f"the frames on the way distinguish {decided.candidates[0]} from {decided.candidates[1]}"
-        case RotationReason.ONE_CANDIDATE:
-            return "there is no second candidate to compare with, so a new side is viewed"
-        case RotationReason.NEW_SIDE:
-            return "no second object is likely, so a new side is viewed"
-        case RotationReason.SEVERAL_POSES:
-            return "the leading candidate fits in several poses, so a new side is viewed"
-        case RotationReason.EVEN_STEPS:
-            return "the views are taken in even steps"
-        case RotationReason.RANDOM:
-            return "the rotation is random"
-        case RotationReason.LEAST_RISK:
-            return "the expected risk of a wrong object is least there, or hardly more, and the side is new"
         case _:
-            return decided.note
+            return decided.reason.words or decided.note
 
 
 def _side_words(side: str, s_left: float, s_right: float, candidates: int) -> str:
@@ -299,7 +426,7 @@ def _arcs_words(arcs_deg: Sequence[tuple[float, float]]) -> str:
 
 def similar_objects_words(similar: SimilarObjects) -> list[str]:
     """Return what an object can be confused with, a line for each finding."""
-    lines = [words] if (words := symmetry_words(similar)) else []
+    lines = list(filter(None, [symmetry_words(similar)]))
     lines += [
         f"looks like {similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects
     ]
@@ -308,36 +435,15 @@ def similar_objects_words(similar: SimilarObjects) -> list[str]:
 
 def note_words(note: Note) -> str:
     """Return a note as a sentence without its full stop."""
-    v = note.values
-    match note.code:
-        case NoteCode.MIXED_EMPTY_TABLE:
-            names, one = v["objects"], len(v["objects"]) == 1
-            return (
-                f"{_some(names)} {'was' if one else 'were'} enrolled {'with' if v['with_image'] else 'without'} an "
-                "empty-table image, unlike the other objects, and such views compare badly"
-            )
-        case NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE:
-            return "most objects were enrolled without an empty-table image, so the search does not use it"
-        case NoteCode.EMPTY_TABLE_DOUBTED:
-            return f"the empty-table image may be outdated ({_problems(v)})"
-        case NoteCode.EMPTY_TABLE_MISSING:
-            return f"the search has no empty-table image ({_problems(v)})"
-        case NoteCode.EMPTY_TABLE_OF_ENROLLMENT:
-            return f"the empty-table image of the enrollment is used ({_problems(v)})"
-        case NoteCode.EMPTY_TABLE_CHANGED:
-            return f"the bench no longer looks like its empty-table image: {problem_text(v['problem'])}"
-        case NoteCode.TABLE_DIFFERS:
-            return f"the table does not look as it did at {v['taken_utc']}; an object that is round may be on it"
-        case NoteCode.NOT_RECORDED:
-            return f"the answer is not recorded: {v['what'].rstrip('.')}"
-        case NoteCode.NOT_COMPARED:
-            return f"the leading candidates are not compared pixel by pixel: {v['what'].rstrip('.')}"
-        case NoteCode.LOCAL_COPY:
-            return f"the server of the catalog cannot be used; this uses the copy of {v['copied_utc']}"
-
-
-def _problems(values: dict[str, Any]) -> str:
-    return "; ".join(problem_text(problem) for problem in values["problems"])
+    values = note.values
+    problems = [*values.get("problems", ()), *([values["problem"]] if "problem" in values else ())]
+    named = {**values, "problems": "; ".join(map(problem_text, problems))}
+    if note.code is NoteCode.MIXED_EMPTY_TABLE:
+        names = values["objects"]
+        more = [f"{len(names) - 3} more"] if len(names) > 3 else []
+        named["objects"] = joined([*names[:3], *more])
+        named |= {"were": "was" if len(names) == 1 else "were", "how": "with" if values["with_image"] else "without"}
+    return filled(note.code.words, **named).rstrip(".")
 
 
 def note_steps(note: Note) -> NextSteps:
@@ -353,12 +459,3 @@ def note_steps(note: Note) -> NextSteps:
             return ("Check that the table is empty. If it is not, remove the object, and", Do.EMPTY_TABLE())
         case _:
             return steps_from_json(note.values.get("steps", ()))
-
-
-def wait_words(reason: WaitReason) -> str:
-    """Return what a plan waits for."""
-    return "the next object" if reason is WaitReason.NEXT_OBJECT else "the first object, on the empty table"
-
-
-def _some(names: list[str]) -> str:
-    return joined(names[:3]) if len(names) <= 3 else f"{', '.join(names[:3])} and {len(names) - 3} more"

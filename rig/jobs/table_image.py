@@ -8,7 +8,7 @@ from rig.catalog import Action
 from rig.core.errors import TableNotEmpty, ViewRejected
 from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import sentence
-from rig.events.lines import line
+from rig.events.wording import line
 from rig.jobs.desk import Desk, Remark, Steps
 from rig.plans.operator import Choice, Question, Subject
 from rig.plans.photograph_table import photograph_table

@@ -35,7 +35,7 @@ def add_records(routes: Routes, server: Server) -> None:
     @routes.watch.get("/runs/{name}", tags=["runs"], responses={200: {"model": SavedRunBody}})
     def get_run(name: str) -> Response:
         """Return the events of a saved run."""
-        from rig.events.lines import page_line
+        from rig.events.wording import page_line
 
         saved = load(name)
         with saved.damage():

@@ -17,7 +17,7 @@ from rig.core.plugins import plugins
 from rig.doctor.context import open_context
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ranked, Started, event_dict
-from rig.events.lines import next_steps, page_line
+from rig.events.wording import next_steps, page_line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Step, Steps
 from rig.jobs.doctor import examine
 from rig.jobs.enroll import enroll, enroll_list

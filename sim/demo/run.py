@@ -26,7 +26,7 @@ from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.phrases import duration_words, signed
 from rig.events.events import Accepted
-from rig.events.lines import line
+from rig.events.wording import line
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table

@@ -160,7 +160,7 @@ def jog(
     """
     from rig.cli.ui.desk import CommandDesk
     from rig.events.events import event_dict
-    from rig.events.lines import line
+    from rig.events.wording import line
     from rig.jobs.table import jog as jog_job
 
     if not sys.stdin.isatty():

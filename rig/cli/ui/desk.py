@@ -17,7 +17,7 @@ from rig.core.clock import Clock, SystemClock
 from rig.core.next_steps import in_words
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
-from rig.events.lines import line
+from rig.events.wording import line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Steps
 from rig.plans.operator import Operator, Unattended
 

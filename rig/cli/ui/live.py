@@ -27,8 +27,7 @@ from rig.events.events import (
     Waiting,
     event_dict,
 )
-from rig.events.lines import line
-from rig.events.wording import ranking_words
+from rig.events.wording import line, ranking_words
 from rig.plans.estimate import TimeLeft
 
 KEYS = "Ctrl+Z: pause, Ctrl+C: stop"

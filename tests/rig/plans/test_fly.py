@@ -16,7 +16,7 @@ from rig.core.errors import DeviceSilent, LimitExceeded, ObjectMoved, RigError, 
 from rig.core.next_steps import Do
 from rig.devices.camera import Frame
 from rig.events.events import Accepted, Enrolled, Event, ScanStarted
-from rig.events.lines import line
+from rig.events.wording import line
 from rig.motion.flight_views import FlightFrames, irregular_stamps
 from rig.motion.move import MotionTimes
 from rig.motion.scan_speed import SpeedLimit
