@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from math import inf, isfinite, nan
 from typing import Final, NamedTuple
 
-from rig.charts import svg
 from rig.charts.xy import Axis, Chart, Series
 from rig.core.phrases import percent, percent_words, short
 from rig.events.events import Candidate, Ranked
@@ -15,7 +14,6 @@ SHOWN: Final = 5
 _COLOURS: Final = 8  # more colours cannot be told from each other, also by people who see fewer; later ones are dashed
 _LETTERS: Final = 36
 """Letters of a name; the tables of a page have all of them."""
-_WIDTH, _BAR_PX, _ROW_PX = 400.0, 336.0, 34.0
 _FAR: Final = 3.0
 """A threshold is off the scale if its distance from the scores exceeds their range by this factor."""
 
@@ -48,16 +46,15 @@ def candidates_chart(
     min_score: float | None = None,
     rotated_deg: Mapping[int, float] | None = None,
     enough_deg: float | None = None,
-    alone: bool = False,
-) -> str:
-    """Draw the best five candidates: their probabilities, or their scores without them, after each view.
+) -> Chart:
+    """Return the chart of the best five candidates: their probabilities, or their scores without them, after each view.
 
     In the dense search, "not enrolled" is one more.
 
     Parameters
     ----------
     ranked
-        The candidates after each view; at least one view. With one alone, the chart has bars.
+        The candidates after each view; at least one view.
     styles
         The styles of the page.
     answer
@@ -68,41 +65,7 @@ def candidates_chart(
         For each view of a search in motion, the rotation since the first view.
     enough_deg
         The rotation after which the evidence was enough for an answer; None if it was not.
-    alone
-        For a file of its own: see `rig.charts.svg.drawing`.
     """
-    if len(ranked) > 1:
-        return candidate_lines(ranked, styles, answer, min_score, rotated_deg, enough_deg).svg(alone=alone)
-    parts = [svg.text("The leading candidates", (0, 13), "title", anchor="start")]
-    best = _best(ranked[-1])
-    what = "score per view" if best[0].probability is None else "probability"
-    parts.append(svg.text(what, (0, 30), "small", anchor="start"))
-    y = 40.0
-    for one in best:
-        y += _ROW_PX
-        parts.append(svg.text(short(one.name, _LETTERS), (0, y), "name", anchor="start"))
-        parts.append(svg.text(_words(one), (_WIDTH, y + 14), "name", anchor="end"))
-        length = _BAR_PX * min(max(_value(one), 0.0), 1.0)
-        kind = f"bar {styles[one.name].colour}"
-        parts.append(svg.element("rect", x=0.0, y=y + 6, width=max(length, 2.0), height=8.0, class_=kind))
-    words, least = _threshold(ranked[-1], min_score)
-    if least is not None:
-        at = _BAR_PX * min(max(least, 0.0), 1.0)
-        parts.append(svg.line((at, 44), (at, y + 20), "curve limit dashed"))
-        parts.append(svg.text(words, (at, y + 36), "small", anchor="end" if at > _WIDTH / 2 else "start"))
-    label = f"The leading candidates: {', '.join(f'{one.name} {_words(one)}' for one in best)}"
-    return svg.drawing(_WIDTH, y + 42, label, parts, alone=alone)
-
-
-def candidate_lines(
-    ranked: Sequence[Ranked],
-    styles: Styles,
-    answer: str | None = None,
-    min_score: float | None = None,
-    rotated_deg: Mapping[int, float] | None = None,
-    enough_deg: float | None = None,
-) -> Chart:
-    """Return the chart of the candidates after several views; parameters as in `candidates_chart`."""
     values = [{one.name: _value(one) for one in _all(event)} for event in ranked]
     x = [event.index + 1.0 if rotated_deg is None else rotated_deg[event.index] for event in ranked]
     series = []

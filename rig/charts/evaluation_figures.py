@@ -111,26 +111,12 @@ def _rates(
 
 
 def _title(results: dict[str, Any]) -> str:
+    """Return what was measured; the tables beside it name all settings."""
     settings = results["settings"]
-    dataset, condition, protocol = settings["dataset"], settings["condition"], settings["protocol"]
-    size = condition["size_px"] or max(dataset["width_px"], dataset["height_px"])
-    words = [
-        f"{dataset['name']}, {len(dataset['objects'])} objects, noise {condition['noise']} at {size} px",
-        f"{protocol['trials']} trials an object",
-    ]
+    dataset, condition = settings["dataset"], settings["condition"]
+    words = [f"{dataset['name']}, {len(dataset['objects'])} objects", f"noise {condition['noise']}"]
     if results["reported"]:
         words.append("objects {} to {}".format(*results["reported"]))
-    if condition["background"] != "same":
-        words.append(f"{condition['background']} background")
-    if condition["rotation_deg"]:
-        words.append(f"rotated by up to {condition['rotation_deg']:g}°")
-    if condition["perturbations"] != "none":
-        kinds = condition["perturbations"].split("+")
-        words.append("+".join(kinds) if len(kinds) <= 2 else f"{len(kinds)} perturbations")
-    if protocol["enrolled"]:
-        words.append(f"{protocol['enrolled']} views enrolled")
     if condition["descriptor"] != "cedd":
         words.append(condition["descriptor"])
-    if condition["prefilter_px"]:
-        words.append(f"prefilter {condition['prefilter_px']:g} px")
-    return "; ".join(words)
+    return "; ".join([*words, f"{settings['protocol']['trials']} trials an object"])

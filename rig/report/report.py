@@ -1,11 +1,12 @@
 """The report: one self-contained HTML file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from statistics import fmean, median
+from typing import Any, Final, NamedTuple
 
 from jinja2 import Template
 from markupsafe import Markup
@@ -14,13 +15,12 @@ from hbr import Outcome
 from hbr.core.angles import wrap360
 from rig.charts.candidates import Styles, candidates_chart
 from rig.charts.compass import decision_chart, polar_path
-from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
-from rig.core.phrases import azimuth_words, counted, percent_words, sentence, signed
+from rig.core.phrases import azimuth_words, counted, listed, percent_words, sentence, signed
 from rig.core.templates import environment
-from rig.events.events import Decided
+from rig.events.events import Decided, Identified
 from rig.events.wording import (
     NOT_ENROLLED,
     answer_words,
@@ -31,11 +31,11 @@ from rig.events.wording import (
     outcome_words,
     ranking_words,
     share_words,
+    similar_objects_words,
     verification_words,
 )
 from rig.report.pictures import contact_sheet, data_uri, thumbnail
 from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord, ReportView
-from rig.report.summary import enrollment_items, totals
 from rig.search.saved_run import SavedRun
 
 _STAMP: Final = (56, 56)  # px: it only helps to recognise the object; every picture makes the file of the report larger
@@ -176,7 +176,7 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
             rotated_deg=rotated_deg if record.in_motion else None,
             enough_deg=rotated_deg[enough.index] if enough else None,
         )
-        candidates = Markup(chart)
+        candidates = Markup(chart.svg())
     return Shown(
         number=number,
         stamp=data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
@@ -293,20 +293,7 @@ def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> Shown:
         label = f"Contact sheet of {record.name}: {line}, each with its azimuth in degrees"
         shown["sheet"] = Markup(contact_sheet(pictures, azimuth_deg, label))
         shown["stamp"] = data_uri(thumbnail(pictures[0], _STAMP))
-        shown["sharpness"] = Markup(_sharpness(record).svg())
     return shown
-
-
-def _sharpness(record: EnrollmentRecord) -> Chart:
-    """Return the chart of the sharpness of each view."""
-    series = []
-    for label, colour, retaken in (("views", MEASURED, False), ("retaken views", MODEL, True)):
-        views = [view for view in record.views if bool(view.rejected) is retaken]
-        sharpness = [view.evidence.sharpness for view in views]
-        if views:
-            series.append(Series(label, [view.azimuth_deg for view in views], sharpness, colour))
-    around = Axis("azimuth, °", ticks=tuple(90.0 * k for k in range(5)))
-    return Chart("Sharpness of the views", around, Axis("squared levels", span=(0.0,)), series)
 
 
 def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -329,3 +316,95 @@ def _text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(_text(item) for item in value) or "–"
     return str(value)
+
+
+# -- the numbers at the top, and beside the views of an object ---------------------------------------------------------
+
+
+class SummaryItem(NamedTuple):
+    """A number with its label and a note."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+def count_of(correctness: Correctness, records: Sequence[IdentificationRecord]) -> int:
+    """Return the number of searches with this correctness."""
+    return sum(record.correctness is correctness for record in records)
+
+
+def totals(
+    enrollments: Sequence[EnrollmentRecord], identifications: Sequence[IdentificationRecord]
+) -> Iterator[SummaryItem]:
+    """Yield the headline numbers of a run; the numbers of a single enrollment are beside its views instead."""
+    if len(enrollments) + len(identifications) > 1 and enrollments:
+        views = counted(sum(len(record.views) for record in enrollments), "view")
+        retakes = counted(sum(record.retakes for record in enrollments), "retake")
+        finished = sum(record.result is not None for record in enrollments)
+        yield SummaryItem("objects enrolled", f"{finished}", f"{views}, {retakes}")
+    answers = [record.answer for record in identifications if record.answer is not None]
+    if len(identifications) == 1 and not identifications[0].truth:
+        for answer in answers:
+            yield from _answer_items(answer)
+        return
+    # Right and wrong answers, of the objects whose names are known and of those without one.
+    with_truth = [record for record in identifications if record.answer and record.truth]
+    known = [record for record in with_truth if record.truth and record.truth.name is not None]
+    unknown = [record for record in with_truth if record.truth and record.truth.name is None]
+    if known:
+        right, ambiguous = (count_of(one, known) for one in (Correctness.RIGHT, Correctness.AMBIGUOUS))
+        yield SummaryItem("found", f"{right}/{len(known)}", "enrolled objects identified correctly")
+        yield SummaryItem("ambiguous", f"{ambiguous}/{len(known)}", "may be one of several enrolled objects")
+    if unknown:
+        right = count_of(Correctness.RIGHT, unknown)
+        yield SummaryItem("unknown objects recognised", f"{right}/{len(unknown)}", "objects never enrolled")
+    # What the searches took.
+    if answers:
+        taken = [answer.views for answer in answers]
+        travelled = [answer.travelled_deg for answer in answers]
+        yield SummaryItem("views to an answer", f"{fmean(taken):.1f}", f"mean; {min(taken)} to {max(taken)}")
+        yield SummaryItem("rotation", f"{fmean(travelled):.0f}°", f"mean of a search; {sum(travelled):.0f}° in all")
+    errors = [error for record in identifications if (error := record.pose_error_deg) is not None]
+    if errors:
+        yield SummaryItem(
+            "pose error", f"{median(errors):.1f}°", f"median of {len(errors)}; largest {max(errors):.1f}°"
+        )
+
+
+def enrollment_items(record: EnrollmentRecord) -> Iterator[SummaryItem]:
+    """Yield the numbers of one enrollment."""
+    views = record.views
+    yield SummaryItem("views", f"{len(views)}", f"of {record.planned} planned")
+    yield SummaryItem("retakes", f"{record.retakes}", listed(reason for view in views for reason in view.rejected))
+    if views:
+        sharpness = [view.evidence.sharpness for view in views]
+        levels = [view.evidence.mean_level for view in views]
+        yield SummaryItem(
+            "sharpness", f"{median(sharpness):.0f}", f"median; {min(sharpness):.0f} to {max(sharpness):.0f}"
+        )
+        yield SummaryItem("mean level", f"{fmean(levels):.0f}", f"of 255; {min(levels):.0f} to {max(levels):.0f}")
+    moves = [view.move for view in views if view.move is not None]
+    if moves:
+        off = max(abs(move.encoder_deg - move.commanded_deg) for move in moves)
+        yield SummaryItem("position error", f"{off:.2f}°", "largest, by the encoder")
+    gaps = [
+        abs(move.rotation_encoder_deg - move.rotation_imu_deg) for move in moves if move.rotation_imu_deg is not None
+    ]
+    if gaps:
+        agree = f"largest difference; {sum(move.agrees for move in moves)} of {len(moves)} moves agree"
+        yield SummaryItem("encoder against gyro", f"{max(gaps):.2f}°", agree)
+    if record.similar:
+        yield SummaryItem("compared with the catalog", "; ".join(similar_objects_words(record.similar)))
+    if record.result:
+        yield SummaryItem("bench time", f"{record.result.seconds:.0f} s")
+
+
+def _answer_items(answer: Identified) -> Iterator[SummaryItem]:
+    yield SummaryItem("answer", outcome_words(answer))
+    if answer.confidence is not None:
+        yield SummaryItem("confidence", percent_words(answer.confidence))
+    yield SummaryItem("score", f"{answer.score:.3f}", f"per view; margin {signed(answer.margin, 3)}")
+    yield SummaryItem("views", f"{answer.views}")
+    yield SummaryItem("rotation", f"{answer.travelled_deg:.0f}°")
+    yield SummaryItem("bench time", f"{answer.seconds:.1f} s")

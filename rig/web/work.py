@@ -162,7 +162,7 @@ class ServedDesk(Desk):
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
         if isinstance(event, Ranked):
             self._ranked.append(event)
-            self._worker.charts[job.id] = candidates_chart(self._ranked, self._styles, alone=True)
+            self._worker.charts[job.id] = candidates_chart(self._ranked, self._styles).svg(alone=True)
         if isinstance(event, Enrolled | Identified):
             job.result, job.result_text = event_dict(event), text
         self._publish(text, next_steps(event), values)

@@ -11,7 +11,7 @@ from hbr import Outcome
 from rig.events.events import Accepted, Moved, Rejected, Started
 from rig.report import Correctness, EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
-from rig.report.summary import enrollment_items, totals
+from rig.report.report import enrollment_items, totals
 from rig.views.capture import RejectReason
 from tests.rig.report.report_samples import enrolled, enrolling, evidence, identified, identifying, moved
 
