@@ -1,4 +1,4 @@
-"""Charts on the circle of azimuths around the table, seen from above: views, the camera's path, and decisions."""
+"""Charts on the circle of azimuths around the table, seen from above: the camera's path, and the table's angle."""
 
 from collections.abc import Collection, Sequence
 from itertools import accumulate
@@ -7,14 +7,12 @@ from typing import Final, NamedTuple
 
 from rig.charts import svg
 from rig.charts.svg import Point
-from rig.core.phrases import azimuth_words, filled
-from rig.events.events import Weighed
+from rig.core.phrases import azimuth_words
 
 SIZE: Final = 400.0  # units of the drawing: a page scales it to its place
 CENTRE: Final = (SIZE / 2, SIZE / 2)
 RIM: Final = 160.0  # leaves room for the labels around it
 
-# Rings of the chart of a path.
 _INNERMOST, _OUTERMOST = 60.0, 145.0
 _STOP_PX: Final = 8.0
 _SEEN_PX: Final = 3.0
@@ -22,9 +20,6 @@ _ARROW_PX: Final = 9.0
 _ARC_STEP_DEG: Final = 4.0  # a chord leaves the largest circle by 0.1 px, less than a line is wide
 _MOST_ARC_STEPS: Final = 5_000
 """A damaged record can have any rotation."""
-
-# Rings of the chart of a decision: the curves are between the first two, the bars of the cost between the others.
-_BEST, _WORST, _BARS, _BARS_END = 24.0, 118.0, 124.0, 154.0
 
 
 def polar(radius: float, azimuth_deg: float) -> Point:
@@ -132,62 +127,3 @@ def _arrowhead(arc: Sequence[Point]) -> str:
 
     tail = _STOP_PX + _ARROW_PX
     return svg.path([at(_STOP_PX, 0), at(tail, _ARROW_PX / 2), at(tail, -_ARROW_PX / 2)], "arrow", close=True)
-
-
-def decision_chart(
-    here_deg: float, weighed: Weighed, rotation_deg: float, words: str, *, seen_deg: Sequence[float] = ()
-) -> str:
-    """Draw the expected confusion and the motion cost of every possible rotation of a dense search, and the chosen one.
-
-    Parameters
-    ----------
-    here_deg
-        Azimuth of the view before the decision.
-    weighed
-        All possible rotations.
-    rotation_deg
-        The chosen rotation of the camera around the object.
-    words
-        The decision and its reason, as the report says it.
-    seen_deg
-        Azimuths of the views so far.
-
-    Returns
-    -------
-    SVG markup. The solid curve is close to the centre at rotations after which little confusion would remain, the
-    dotted curve at rotations after which the two candidates are least similar. The length of the bars outside is the
-    motion cost.
-    """
-    azimuth_deg = [here_deg + rotation for rotation in weighed.rotations_deg]
-    around = sorted(range(len(azimuth_deg)), key=lambda i: azimuth_deg[i] % 360)
-    most = max(weighed.cost)
-    parts = [*_rim(every=90), svg.circle(CENTRE, _BEST, "grid"), svg.circle(CENTRE, _WORST, "grid")]
-
-    def tooltip(i: int) -> str:
-        similarity = "" if weighed.similarity is None else f"; similarity of the candidates {weighed.similarity[i]:.2f}"
-        form = "to {}°: log confusion {:.2f}, motion {:.2f}{}"
-        return svg.title(filled(form, azimuth_words(azimuth_deg[i]), weighed.confusion[i], weighed.cost[i], similarity))
-
-    for i in around:
-        length = (_BARS_END - _BARS) * (weighed.cost[i] / most if most > 0 else 0.0)
-        ends = polar(_BARS, azimuth_deg[i]), polar(_BARS + length, azimuth_deg[i])
-        parts.append(svg.line(*ends, "cost", tooltip(i)))
-    curve = _radii(weighed.confusion)
-    outline = [polar(curve[i], azimuth_deg[i]) for i in around]
-    parts.append(svg.path(outline, "confusion", close=len(around) > 2))
-    if weighed.similarity is not None:
-        dotted = _radii(weighed.similarity)
-        parts.append(svg.path([polar(dotted[i], azimuth_deg[i]) for i in around], "similarity", close=True))
-    chosen = min(range(len(azimuth_deg)), key=lambda i: abs(weighed.rotations_deg[i] - rotation_deg))
-    parts.append(svg.line(CENTRE, polar(RIM, azimuth_deg[chosen]), "chosen"))
-    parts.append(svg.circle(polar(curve[chosen], azimuth_deg[chosen]), 7, "goal", tooltip(chosen)))
-    parts += [svg.circle(polar(RIM, seen), _SEEN_PX, "seen") for seen in seen_deg]
-    parts.append(svg.circle(polar(RIM, here_deg), 6, "stop"))
-    return svg.drawing(SIZE, SIZE, words, parts)
-
-
-def _radii(values: Sequence[float]) -> list[float]:
-    """Scale values to radii between the inner circle (smallest value) and the outer one."""
-    low, high = min(values), max(values)
-    span = high - low
-    return [_BEST + (_WORST - _BEST) * ((value - low) / span if span > 0 else 0.5) for value in values]

@@ -14,13 +14,13 @@ from markupsafe import Markup
 from hbr import Outcome
 from hbr.core.angles import wrap360
 from rig.charts.candidates import Styles, candidates_chart
-from rig.charts.compass import decision_chart, polar_path
+from rig.charts.compass import polar_path
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
 from rig.core.phrases import azimuth_words, counted, listed, percent_words, sentence, signed
 from rig.core.templates import environment
-from rig.events.events import Decided, Identified
+from rig.events.events import Identified
 from rig.events.wording import (
     NOT_ENROLLED,
     answer_words,
@@ -259,7 +259,6 @@ def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> Sh
         decided=" ".join(sentence(one) for one in words if one),
         moved=sentence(move_words(view.move)) if view.move and view.index else "",
         decision=decision_words(decided) if decided else "",
-        chart=_decision(record, view, decided) if decided else Markup(),
     )
 
 
@@ -268,16 +267,6 @@ def _rejections(view: ReportView) -> str:
     reasons = dict.fromkeys(view.rejected)
     more = len(reasons) - _REASONS
     return "; ".join(list(reasons)[:_REASONS]) + (f"; and {more} more" if more > 0 else "")
-
-
-def _decision(record: IdentificationRecord, view: ReportView, decided: Decided) -> Markup:
-    """Return the chart of a decision; empty if the search did not compare all possible rotations."""
-    if decided.weighed is None or not decided.weighed.rotations_deg:
-        return Markup()
-    seen_deg = [_report_azimuth_deg(record, one.azimuth_deg) for one in record.views if one.index < view.index]
-    here_deg = _report_azimuth_deg(record, view.azimuth_deg)
-    words = f"Decision after view {view.index + 1}: {decision_words(decided)}"
-    return Markup(decision_chart(here_deg, decided.weighed, decided.rotation_deg, words, seen_deg=seen_deg))
 
 
 def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> Shown:

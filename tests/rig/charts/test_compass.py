@@ -8,14 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.charts.compass import CENTRE, PathStep, decision_chart, dial, polar, polar_path
-from rig.events.events import Weighed
+from rig.charts.compass import CENTRE, PathStep, dial, polar, polar_path
 from tests.fuzzing import examples
-from tests.rig.charts.drawn import HOSTILE, centre, check_text, having, points, words
+from tests.rig.charts.drawn import centre, check_text, having, points, words
 
 ANGLE = st.floats(-720, 720)
 ROTATION = st.floats(-360, 360).filter(lambda a: abs(a) > 1)
-WEIGHED = Weighed((60.0, -60.0), (-2.0, -1.0), (0.1, 0.2), (0.5, 0.7))
 
 
 def azimuth_of(x: float, y: float) -> float:
@@ -35,8 +33,8 @@ def path(start_deg: float, *rotations_deg: float) -> str:
 
 @pytest.mark.parametrize(
     "svg",
-    [path(0, *[40] * 7), decision_chart(0, WEIGHED, 60, "left 60°"), dial()],
-    ids=["path", "decision", "dial"],
+    [path(0, *[40] * 7), dial()],
+    ids=["path", "dial"],
 )
 def test_charts_are_readable_at_the_width_of_a_phone(svg: str) -> None:
     width = float(ET.fromstring(svg).get("viewBox", "").split()[2])
@@ -113,31 +111,3 @@ class TestPolarPath:
 
     def test_path_with_an_impossible_rotation_stays_small(self) -> None:
         assert len(path(0.0, 16_949_387.0)) < 200_000
-
-
-ROTATIONS = tuple(float(rotate) for rotate in range(-175, 185, 5) if rotate)
-
-
-class TestDecisionChart:
-    @examples(6)
-    @given(here=ANGLE, chosen=st.sampled_from(ROTATIONS), seen=st.lists(ANGLE, max_size=4))
-    def test_chosen_rotation_is_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
-        away = tuple(abs(rotate - chosen) for rotate in ROTATIONS)
-        weighed = Weighed(ROTATIONS, tuple(-9 + a for a in away), tuple(abs(t) / 100 for t in ROTATIONS), away)
-        svg = decision_chart(here, weighed, chosen, HOSTILE, seen_deg=seen)
-        (goal,) = having(svg, "goal")
-        x, y = centre(goal)
-        assert apart(azimuth_of(x, y), here + chosen) < 1
-        radii = [hypot(px - CENTRE[0], py - CENTRE[1]) for px, py in points(having(svg, "confusion")[0])]
-        assert min(radii) == pytest.approx(hypot(x - CENTRE[0], y - CENTRE[1]), abs=0.02)
-        assert len(radii) == len(having(svg, "cost")) == len(ROTATIONS)
-        at = [centre(e) for e in (*having(svg, "seen"), *having(svg, "stop"))]
-        assert all(apart(azimuth_of(*one), angle) < 1 for one, angle in zip(at, [*seen, here], strict=True))
-        assert ET.fromstring(svg).get("aria-label") == HOSTILE
-
-    def test_single_object_and_equal_values_are_drawn(self) -> None:
-        for revolutions in ((5.0,), (-5.0, 5.0), ROTATIONS):
-            even = (0.0,) * len(revolutions)
-            svg = decision_chart(0.0, Weighed(revolutions, even, even), revolutions[0], "left")
-            assert not having(svg, "similarity")
-            assert "nan" not in svg

@@ -288,17 +288,12 @@ def test_dense_search_shows_its_decisions(pair: bool) -> None:
     for event in searching_densely(pair=pair):
         record.add(event)
     page = Page(render_report("Search", "", [], [record], meta=META))
-    charts = [attrs["class"] for tag, attrs in page.tags if "confusion" in attrs.get("class", "").split()]
-    assert len(charts) == 2
     text = " ".join(page.texts)
     assert "Most objects were enrolled without an empty-table image" in text
     assert [one.strip() for one in page.texts].count("not enrolled") == 3  # in the table of each view
     assert "Not confident yet: 60.0 %, and 95.0 % ends the search." in text
-    assert "The chart of a decision, seen from above" in text
     reason = "distinguishes mug-white from mug-star, similarity 0.50" if pair else "no second object is likely"
     assert text.count(reason) == 2
-    labels = [attributes["aria-label"] for attributes in page.all("svg")]
-    assert sum(reason in label for label in labels) == 2, "the chart says what its card says"
     assert ["mug-white", "60.0 %", "0.900"] in [row for table in page.tables for row in table]
 
 
