@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from base64 import b64decode
 from contextlib import aclosing
 from importlib.metadata import version
 from typing import Annotated, Any, Final
@@ -131,7 +132,7 @@ def add_bench(routes: Routes, server: Server) -> None:
     @routes.watch.get("/moves/last", tags=["bench"])
     def get_last_move() -> dict[str, Any]:
         """Return the last move of the last job that ended: encoder, servo profile, load and gyro over its time."""
-        values: dict[str, Any] = server.remote.ask("last_move")
+        values: dict[str, Any] = server.remote.call("last_move")
         return values
 
 
@@ -150,47 +151,47 @@ def add_jobs(routes: Routes, server: Server) -> None:
     @routes.watch.get("/jobs", tags=["jobs"], response_model=ListOf[Job])
     def list_jobs(page: Page) -> Response:
         """List the jobs, the newest first."""
-        return page.of(server.remote.ask("jobs"), "id")
+        return page.of(server.remote.call("jobs"), "id")
 
     @routes.operate.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
     def submit_job(body: JobRequest, person: OperatorPerson, response: Response) -> Any:
         """Add a job to the queue."""
-        job = server.remote.ask("submit", request=body, operator=person.name)
+        job = server.remote.call("submit", request=body, operator=person.name)
         response.headers["Location"] = f"{API}/jobs/{job['id']}"
         return job
 
     @routes.watch.get("/jobs/{job_id}", tags=["jobs"], response_model=Job)
     def get_job(job_id: str) -> Any:
         """Return a job."""
-        return server.remote.ask("job", job_id=job_id)
+        return server.remote.call("job", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/cancel", tags=["jobs"], response_model=Job)
     def cancel_job(job_id: str) -> Any:
         """Cancel a job. A running one ends at its next step; views that were taken stay stored."""
-        return server.remote.ask("cancel", job_id=job_id)
+        return server.remote.call("cancel", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/pause", tags=["jobs"], response_model=Job)
     def pause_job(job_id: str) -> Any:
         """Pause a job after its present view; the table holds its angle."""
-        return server.remote.ask("pause", job_id=job_id)
+        return server.remote.call("pause", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/resume", tags=["jobs"], response_model=Job)
     def resume_job(job_id: str) -> Any:
         """Resume a paused job."""
-        return server.remote.ask("resume", job_id=job_id)
+        return server.remote.call("resume", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/answer", tags=["jobs"], response_model=Job)
     def answer_job(job_id: str, body: AnswerBody) -> Any:
         """Answer the question of a job."""
-        return server.remote.ask("answer", job_id=job_id, choice=body.choice)
+        return server.remote.call("answer", job_id=job_id, choice=body.choice)
 
     @routes.watch.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Jpeg)
     def get_job_view(job_id: str, number: int) -> Jpeg:
         """Return a picture of a recent job as JPEG, the first with number 0."""
-        _, found = server.remote.link.call("view", job_id=job_id, number=number)
-        return Jpeg(found, headers={"Cache-Control": "private, max-age=3600"})
+        found = server.remote.call("view", job_id=job_id, number=number)
+        return Jpeg(b64decode(found), headers={"Cache-Control": "private, max-age=3600"})
 
     @routes.watch.get("/jobs/{job_id}/candidates", tags=["jobs"], response_class=Svg)
     def get_job_candidates(job_id: str) -> Svg:
         """Return the chart of the candidates of a recent search as SVG, after its last view."""
-        return Svg(server.remote.ask("candidates", job_id=job_id), headers={"Cache-Control": "no-store"})
+        return Svg(server.remote.call("candidates", job_id=job_id), headers={"Cache-Control": "no-store"})

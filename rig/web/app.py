@@ -82,7 +82,7 @@ class _Numbers(Collector):
         self._server = server
 
     def collect(self) -> Iterator[Metric]:
-        server, status, numbers = self._server, self._server.remote.status, self._server.remote.ask("numbers")
+        server, status, numbers = self._server, self._server.remote.status, self._server.remote.call("numbers")
         servo = status.get("servo") or {}
         for name, text, value in (
             ("bench_open", "Whether the bench is open.", float(bool(status.get("open")))),
@@ -95,7 +95,7 @@ class _Numbers(Collector):
             if value is not None:
                 yield GaugeMetricFamily(f"rig_{name}", text, value)
         jobs = GaugeMetricFamily("rig_jobs", "Jobs by state.", labels=["state"])
-        states = Counter(job["state"] for job in server.remote.ask("jobs"))
+        states = Counter(job["state"] for job in server.remote.call("jobs"))
         for state in JobState:
             jobs.add_metric([state.value], states[state])
         yield jobs

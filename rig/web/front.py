@@ -7,7 +7,6 @@ the set-up as JSON on standard input.
 import asyncio
 import os
 import resource
-import secrets
 import signal
 import socket
 import sys
@@ -18,16 +17,12 @@ import uvicorn
 from anyio import to_thread
 
 from rig.core.clock import SystemClock
-from rig.safety.saved_state import SERVER_FOLDER
-from rig.web.access import Lease, Sessions, Tokens
 from rig.web.api_catalog import UPLOAD
 from rig.web.app import create_app
 from rig.web.guard import Guard, PatientProtocol
-from rig.web.hub import Hub
 from rig.web.link import Link
-from rig.web.remote_bench import RemoteBench
 from rig.web.server import Server
-from rig.web.setup import WEB_NICE, BenchCatalog, Listening, Setup, print_note, set_priority, shorten_pauses
+from rig.web.setup import WEB_NICE, Listening, Setup, set_priority, shorten_pauses
 
 # each connection is a file; the usual limit of 1,024 is reached by a script that does not close them
 MAX_FILES: Final = 65_536
@@ -37,28 +32,6 @@ SWITCH_S: Final = 0.001
 """Time after which a thread hands the interpreter to the next one: a fifth of the usual time, for the same reason."""
 SIGN_OF_LIFE_S: Final = 1.0  # thirty may be late before `rig.web.run` ends this process
 END_S: Final = 4.0  # longer: `rig serve` ends later; shorter: requests that are nearly done are cut off
-
-
-def make_server(setup: Setup, clock: SystemClock) -> Server:
-    """Return the parts of a server; nothing listens yet, and `Server.remote` is not connected to the bench."""
-    hub = Hub(secrets.token_hex(4))
-    catalog = BenchCatalog(setup.catalog_place, clock, lambda state: hub.publish("catalog", state), print_note)
-
-    def received(kind: str, data: Any) -> None:
-        if kind == "catalog":
-            catalog.become(data)  # which publishes it
-        else:
-            hub.publish(kind, data)
-
-    return Server(
-        setup=setup,
-        clock=clock,
-        remote=RemoteBench(setup.state_folder, clock, received),
-        hub=hub,
-        sessions=Sessions(Tokens(setup.state_folder / SERVER_FOLDER, clock), clock, setup.local_token),
-        lease=Lease(clock, lambda values: hub.publish("lease", values)),
-        catalog=catalog,
-    )
 
 
 def guarded(server: Server) -> Guard:
@@ -127,15 +100,15 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
     set_priority(WEB_NICE)
     sys.setswitchinterval(SWITCH_S)
     setup = Setup.model_validate_json(sys.stdin.buffer.read())
-    server = make_server(setup, SystemClock())
 
     def ended() -> None:
         web.should_exit = True
         server.hub.close()
         threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
 
-    server.remote.connect(socket.socket(fileno=link_descriptor), ended)
-    web = _Web(uvicorn_config(guarded(server), setup.listening), server.remote.link)
+    server = Server(setup, SystemClock(), socket.socket(fileno=link_descriptor), ended)
+    web = _Web(uvicorn_config(guarded(server), setup.listening), server.remote)
+    server.remote.start()
     shorten_pauses()
     with server.catalog.background_delivery():
         web.run([socket.socket(fileno=socket_descriptor)])

@@ -1,33 +1,42 @@
 """The connection between the two processes of a server: the one that owns the bench, and the one that answers the web.
 
-Each end offers functions to the other one. A message is a line of JSON and a content of bytes, which may be empty.
-Neither side ever waits for the other while it sends.
+Each end offers functions to the other one. A message is a line of JSON. Neither side ever waits for the other while it
+sends. `RemoteBench` is the end of the web process.
 """
 
+import asyncio
 import json
 import socket
 import threading
+from base64 import b64decode
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from itertools import count
+from pathlib import Path
 from typing import Any, Final
 
 from pydantic_core import to_jsonable_python
 
 from rig.core import errors
+from rig.core.clock import Clock, seconds_between
 from rig.core.errors import BenchBusy, RigError
 from rig.core.next_steps import Do, steps_as_json, steps_from_json
+from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
 
 MAX_BYTES: Final = 64_000_000  # a longer line is no message of the other end
 MAX_UNSENT: Final = 20_000
 """Messages that wait for a web process that does not read. Then the oldest is dropped: a bench must not wait."""
 # longer: a request of a browser hangs with the bench; shorter: a busy computer looks like a dead one
 ANSWER_S: Final = 10.0
+PICTURE_S: Final = 0.08
+"""Shortest time between two pictures that are fetched from the bench, for all pages together."""
+CONFIRM_S: Final = 3.0
+"""How long a request to stop is held until the bench has confirmed it; the page warns after one second."""
 
 Functions = Mapping[str, Callable[..., Any]]
-"""Functions that the other end may call: they take JSON values, and return values or a tuple of values and bytes.
+"""Functions that the other end may call: they take and return JSON values.
 
 They run in the link's own thread. Their `RigError` is raised at the other end.
 """
@@ -47,7 +56,7 @@ class Link:
         self._changed = threading.Condition()
         self._closed = False
         self._numbers = count(1)
-        self._waiting: dict[int, Future[tuple[Any, bytes]]] = {}
+        self._waiting: dict[int, Future[Any]] = {}
         self._threads = [threading.Thread(target=run, name="link", daemon=True) for run in (self._write, self._read)]
 
     def start(self) -> None:
@@ -59,12 +68,12 @@ class Link:
         """Call a function at the other end without an answer, from any thread; nothing happens if that end has gone."""
         self._send({"call": name, "values": values})
 
-    def call(self, name: str, **values: Any) -> tuple[Any, bytes]:
-        """Call a function at the other end and return its result and content; its errors are raised here.
+    def call(self, name: str, **values: Any) -> Any:
+        """Call a function at the other end and return its result; its errors are raised here.
 
         Raises `BenchBusy`: there is no answer in time.
         """
-        number, future = next(self._numbers), Future[tuple[Any, bytes]]()
+        number, future = next(self._numbers), Future[Any]()
         self._waiting[number] = future
         try:
             self._send({"call": name, "values": values, "number": number})
@@ -89,11 +98,10 @@ class Link:
                 thread.join()
         self._connection.close()
 
-    def _send(self, message: dict[str, Any], content: bytes = b"") -> None:
-        values = {**message, "content_bytes": len(content)}
-        text = json.dumps(values, ensure_ascii=False, allow_nan=False, default=_json_values).encode()
+    def _send(self, message: dict[str, Any]) -> None:
+        text = json.dumps(message, ensure_ascii=False, allow_nan=False, default=_json_values).encode()
         with self._changed:
-            self._unsent.append(text + b"\n" + content)
+            self._unsent.append(text + b"\n")
             self._changed.notify()
 
     def _write(self) -> None:
@@ -112,21 +120,18 @@ class Link:
         try:
             with self._connection.makefile("rb") as stream, suppress(OSError):
                 while (text := stream.readline(MAX_BYTES)).endswith(b"\n"):
-                    message = json.loads(text)
-                    content = stream.read(size := message["content_bytes"])
-                    if len(content) == size:  # otherwise the other end has gone
-                        self._received(message, content)
+                    self._received(json.loads(text))
         finally:
             if not self._closed:
                 self._ended()
 
-    def _received(self, message: dict[str, Any], content: bytes) -> None:
+    def _received(self, message: dict[str, Any]) -> None:
         """Take a call, or the answer to one."""
         number: int = message.get("number", 0)  # 0 if no answer is expected
         if "call" in message:
-            answer, content = self._answer(message)
+            answer = self._answer(message)
             if number:
-                self._send({**answer, "number": number}, content)
+                self._send({**answer, "number": number})
             return
         future = self._waiting.get(number)
         if future is None or future.done():  # the call has ended already
@@ -136,17 +141,77 @@ class Link:
             error = getattr(errors, kind, RigError)
             future.set_exception(error(what, next_step=steps_from_json(steps), evidence=evidence))
         else:
-            future.set_result((message["result"], content))
+            future.set_result(message["result"])
 
-    def _answer(self, message: dict[str, Any]) -> tuple[dict[str, Any], bytes]:
-        """Call the function that a message names; return its answer, and the content of the answer."""
+    def _answer(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Call the function that a message names, and return its answer."""
         try:
-            result = self._functions[message["call"]](**message["values"])
+            return {"result": self._functions[message["call"]](**message["values"])}
         except RigError as error:
-            return {"error": [type(error).__name__, error.what, steps_as_json(error.steps), error.evidence]}, b""
-        result, content = result if isinstance(result, tuple) else (result, b"")
-        return {"result": result}, content
+            return {"error": [type(error).__name__, error.what, steps_as_json(error.steps), error.evidence]}
 
 
 def _json_values(value: Any) -> Any:
     return to_jsonable_python(value, fallback=str)
+
+
+class RemoteBench(Link):
+    """The bench of another process: calls to the functions of `rig.web.worker.BenchWorker`, its events, and STOP.
+
+    ``received`` gets the kind and the values of each event.
+    """
+
+    def __init__(
+        self,
+        connection: socket.socket,
+        state_folder: Path,
+        clock: Clock,
+        received: Callable[[str, Any], None],
+        ended: Callable[[], None],
+    ) -> None:
+        super().__init__(connection, {"publish": self._published}, ended)
+        self._state_folder = state_folder
+        self._clock = clock
+        self._take = received
+        self.status: dict[str, Any] = {"open": False, "job": None, "error": None}
+        """The last known state of the bench."""
+        self._newest: tuple[int, bytes] = (0, b"")
+        self._age_s: float | None = None
+        self._fetched_ns: int | None = None
+        self._fetching = asyncio.Lock()
+
+    def _published(self, kind: str, data: Any) -> None:
+        if kind == "status":
+            self.status = data
+        self._take(kind, data)
+
+    # -- STOP: it asks no queue, no thread and no disk ----------------------------------------------------------------
+
+    async def stop(self) -> dict[str, Any]:
+        """Stop the table and cancel all jobs; return what the bench has confirmed within `CONFIRM_S`."""
+        request = StopRequest(self._state_folder)
+        answer: StopAnswer | None = None
+        if request.connection is not None:
+            try:
+                async with asyncio.timeout(CONFIRM_S):
+                    answer = stop_answer(await asyncio.get_running_loop().sock_recv(request.connection, 1))
+            except TimeoutError:
+                pass
+            except OSError:
+                answer = StopAnswer.ENDED
+            finally:
+                request.close()
+        return {"ended": answer is StopAnswer.TORQUE_OFF, "answer": answer}
+
+    # -- the picture --------------------------------------------------------------------------------------------------
+
+    async def picture(self) -> tuple[int, bytes, float | None]:
+        """Return the number of the newest frame, the frame as JPEG (empty if there is none), and its age in seconds."""
+        async with self._fetching:
+            now_ns = self._clock.now_ns()
+            if self._fetched_ns is None or seconds_between(self._fetched_ns, now_ns) > PICTURE_S:
+                found = await asyncio.to_thread(self.call, "picture", after=self._newest[0])
+                self._fetched_ns, self._age_s = self._clock.now_ns(), found["age_s"]
+                if found["jpeg"]:
+                    self._newest = (found["number"], b64decode(found["jpeg"]))
+            return (*self._newest, self._age_s)

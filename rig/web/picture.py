@@ -1,4 +1,4 @@
-"""Pictures for the pages: the newest frame, encoded once for all viewers, and the outline of the object in a view."""
+"""Pictures for the pages: the newest frame, and the outline of the object in a view."""
 
 import threading
 from typing import Final
@@ -28,8 +28,6 @@ class LivePicture:
         self._image: NDArray[np.uint8] | None = None
         self.number = 0
         """Number of the newest frame, from 1; 0 if there is none."""
-        self._encoded: tuple[int, bytes] | None = None
-        self._encoding = threading.Lock()
         self._shown_ns: int | None = None
         self._wanted_until_ns = 0
 
@@ -55,14 +53,9 @@ class LivePicture:
 
     def jpeg(self) -> tuple[int, bytes] | None:
         """Return the number of the newest frame and the frame as JPEG; None if there is none yet."""
-        with self._encoding:
-            with self._lock:
-                number, image = self.number, self._image
-            if image is None:
-                return None
-            if self._encoded is None or self._encoded[0] != number:
-                self._encoded = (number, jpeg(image))
-            return self._encoded
+        with self._lock:
+            number, image = self.number, self._image
+        return None if image is None else (number, jpeg(image))
 
 
 def jpeg(image_bgr: NDArray[np.uint8], max_side_px: int = MAX_SIDE_PX) -> bytes:

@@ -16,24 +16,16 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from pydantic import validate_call
-
-from rig.bench import Bench, open_bench
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import JobNotFound, RigError, UsageError, WebEnded, os_errors_as
+from rig.core.errors import RigError, UsageError, WebEnded, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, BenchLock, ServerAddress
-from rig.safety.stop_channel import StopListener, listen
-from rig.web.jobs import JobQueue
-from rig.web.link import Functions, Link
-from rig.web.picture import LivePicture
-from rig.web.requests import Job
-from rig.web.setup import BENCH_NICE, BenchCatalog, Listening, Setup, print_note, set_priority, shorten_pauses
-from rig.web.work import ServedDesk
+from rig.web.link import Link
+from rig.web.setup import BENCH_NICE, Listening, Setup, print_note, set_priority, shorten_pauses
+from rig.web.work import run_job
 from rig.web.worker import BenchWorker
 
 # longer: a failed start is noticed late; shorter: a busy small computer imports the web packages in vain
@@ -62,9 +54,9 @@ def run_server(setup: Setup, ready: Callable[[str], None]) -> None:
     lock = BenchLock(folder, clock)  # one server for each bench
     set_priority(BENCH_NICE)
     try:
-        side = BenchSide(setup, folder, clock, print_note)
+        worker = BenchWorker(setup, clock, print_note, run_job)
         with _socket(listening) as connection:
-            web = WebProcess(side, setup, connection, clock)
+            web = WebProcess(worker, connection, clock)
             try:
                 web.start()
                 address = ServerAddress(
@@ -76,91 +68,15 @@ def run_server(setup: Setup, ready: Callable[[str], None]) -> None:
                 write(folder / SERVER_FILE, address.model_dump_json().encode(), mode=0o600)
                 ready(address.url)
                 shorten_pauses()
-                side.worker.run()
+                worker.run()
                 if web.failure is not None:
                     raise web.failure
             finally:
                 (folder / SERVER_FILE).unlink(missing_ok=True)
                 web.close()
-                side.close()
+                worker.close_stops()
     finally:
         lock.close()
-
-
-class BenchSide:
-    """The queue, the worker and the live picture of a bench, and the functions that the web process calls.
-
-    ``folder`` is that of the stored jobs, and ``report`` gets sentences about the catalog for the terminal.
-    """
-
-    def __init__(self, setup: Setup, folder: Path, clock: SystemClock, report: Callable[[str], None]) -> None:
-        def opened() -> Bench:
-            bench = open_bench(setup.bench, setup.config, seed=setup.seed)
-            bench.camera.observers.append(self.picture.show)
-            return bench
-
-        def run(worker: BenchWorker, job: Job) -> None:
-            ServedDesk(worker, job, setup, catalog).run()
-
-        self.link: Link | None = None
-        self.stops: StopListener = listen(setup.state_folder)
-        self.picture = LivePicture(clock)
-        self.queue = JobQueue(folder, clock, lambda job: self.publish("job", job), self.stops.count)
-        catalog = BenchCatalog(setup.catalog_place, clock, lambda state: self.publish("catalog", state), report)
-        self.worker = BenchWorker(opened, self.queue, self.publish, self.picture, run, self.stops, clock)
-        asked = ("jobs", "job", "submit", "cancel", "pause", "resume", "answer")
-        self._functions: Functions = {
-            **{name: validate_call(getattr(self.queue, name)) for name in asked},
-            "view": self._view,
-            "candidates": self._candidates,
-            "picture": self._picture,
-            "numbers": self._numbers,
-            "last_move": self.worker.last_move,
-        }
-
-    def publish(self, kind: str, data: Any) -> None:
-        """Send a message to the listeners of the web process, if there is one."""
-        if self.link is not None:
-            self.link.tell("publish", kind=kind, data=data)
-
-    def connect(
-        self,
-        connection: socket.socket,
-        ended: Callable[[], None] = lambda: None,
-        alive: Callable[[], None] = lambda: None,
-    ) -> Link:
-        """Return the link to a web process, which gets events from now on, beginning with the present state.
-
-        ``ended`` is called when the process has gone, and ``alive`` at each of its signs of life.
-        """
-        self.link = link = Link(connection, {**self._functions, "alive": alive}, ended)
-        link.start()
-        self.publish("status", self.worker.status)
-        return link
-
-    def close(self) -> None:
-        self.stops.close()
-
-    def _view(self, job_id: str, number: int) -> tuple[None, bytes]:
-        pictures = self.worker.views.get(job_id, [])
-        if not 0 <= number < len(pictures):
-            raise JobNotFound("There is no such picture (any more).", next_step="The catalog has all enrolled views.")
-        return None, pictures[number]
-
-    def _candidates(self, job_id: str) -> str:
-        if job_id not in self.worker.charts:
-            raise JobNotFound("There is no such chart (any more).", next_step="Open the report of the saved run.")
-        return self.worker.charts[job_id]
-
-    def _picture(self, after: int) -> tuple[dict[str, Any], bytes]:
-        """Return the newest frame, unless its number is ``after``, and ask the camera for more."""
-        self.picture.want()
-        found = self.picture.jpeg() if self.picture.number != after else None
-        number, content = found or (after, b"")
-        return {"number": number, "age_s": self.picture.age_s}, content
-
-    def _numbers(self) -> dict[str, Any]:
-        return {"jobs_ended": self.worker.jobs_ended, "stops": self.stops.count()}
 
 
 class WebProcess:
@@ -169,9 +85,8 @@ class WebProcess:
     ``connection`` is the listening socket, which outlives the process: requests wait in it for the next one.
     """
 
-    def __init__(self, side: BenchSide, setup: Setup, connection: socket.socket, clock: SystemClock) -> None:
-        self._side = side
-        self._setup = setup
+    def __init__(self, worker: BenchWorker, connection: socket.socket, clock: SystemClock) -> None:
+        self._worker = worker
         self._connection = connection
         self._clock = clock
         self._starts: deque[int] = deque(maxlen=MAX_STARTS)
@@ -214,8 +129,8 @@ class WebProcess:
             )
         assert self._process.stdin is not None
         with suppress(BrokenPipeError), self._process.stdin as standard_input:  # the process has ended already
-            standard_input.write(self._setup.model_dump_json().encode())
-        self._link = self._side.connect(ours, self._lost, self._lives)
+            standard_input.write(self._worker.setup.model_dump_json().encode())
+        self._link = self._worker.connect(ours, self._lost, self._lives)
 
     def _lives(self) -> None:
         self._alive_ns = self._clock.now_ns()
@@ -233,7 +148,7 @@ class WebProcess:
                 continue
             if self._closed.is_set():
                 return
-            self._side.queue.hold()
+            self._worker.queue.hold()
             self._end()
             full = len(self._starts) == MAX_STARTS
             if full and seconds_between(self._starts[0], self._clock.now_ns()) < STARTS_WITHIN_S:
@@ -241,7 +156,7 @@ class WebProcess:
                     f"The web process has ended {MAX_STARTS} times within a minute. The running job has stopped.",
                     next_step=("Look at the messages above.", Do.SERVE_AGAIN()),
                 )
-                self._side.worker.end()
+                self._worker.end()
                 return
             print_note("The web process has ended. The running job pauses, and another web process starts.")
             self._spawn()

@@ -3,6 +3,8 @@
 import asyncio
 import hashlib
 import json
+import secrets
+import socket
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,30 +17,40 @@ from starlette.requests import HTTPConnection
 from rig.core.clock import SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.core.next_steps import Do
-from rig.web.access import LOCAL, Lease, Person, Role, Sessions
+from rig.safety.saved_state import SERVER_FOLDER
+from rig.web.access import LOCAL, Lease, Person, Role, Sessions, Tokens
 from rig.web.hub import Hub
-from rig.web.remote_bench import RemoteBench
-from rig.web.setup import BenchCatalog, Setup
+from rig.web.link import RemoteBench
+from rig.web.setup import BenchCatalog, Setup, print_note
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"
 MAX_PAGE: Final = 500  # larger: a list holds the process that receives STOP for longer
 
 
-@dataclass(slots=True)
 class Server:
-    """The objects that the application works with.
+    """The objects that the application works with; nothing listens yet, and ``remote`` has to be started.
 
-    ``remote`` is the bench, which another process owns.
+    ``connection`` leads to the process that owns the bench; ``ended`` is called once when that process has gone.
     """
 
-    setup: Setup
-    clock: SystemClock
-    remote: RemoteBench
-    hub: Hub
-    sessions: Sessions
-    lease: Lease
-    catalog: BenchCatalog
+    def __init__(
+        self, setup: Setup, clock: SystemClock, connection: socket.socket, ended: Callable[[], None] = lambda: None
+    ) -> None:
+        self.setup = setup
+        self.hub = Hub(secrets.token_hex(4))
+        self.remote = RemoteBench(connection, setup.state_folder, clock, self._received, ended)
+        self.sessions = Sessions(Tokens(setup.state_folder / SERVER_FOLDER, clock), clock, setup.local_token)
+        self.lease = Lease(clock, lambda values: self.hub.publish("lease", values))
+        self.catalog = BenchCatalog(
+            setup.catalog_place, clock, lambda state: self.hub.publish("catalog", state), print_note
+        )
+
+    def _received(self, kind: str, data: Any) -> None:
+        if kind == "catalog":
+            self.catalog.become(data)  # which publishes it
+        else:
+            self.hub.publish(kind, data)
 
     def person(self, request: HTTPConnection) -> Person | None:
         """Return the sender of a request; None if it is not known.

@@ -31,7 +31,6 @@ from rig.plans.tray import TrayItem
 from rig.web import requests
 from rig.web.picture import Outliner, jpeg
 from rig.web.requests import Job, JobState, TrayObject
-from rig.web.setup import BenchCatalog, Setup
 from rig.web.worker import BenchWorker
 
 VIEW_PX: Final = 480  # a tile on the page of the job; the full image comes from the catalog
@@ -59,26 +58,17 @@ class ServedDesk(Desk):
     is_there = True
     log_waits_for_server = False  # which may be away: that would delay the answer to a STOP
 
-    def __init__(self, worker: BenchWorker, job: Job, setup: Setup, catalog: BenchCatalog) -> None:
+    def __init__(self, worker: BenchWorker, job: Job) -> None:
         self.operator = self
-        self.config = setup.config
-        self.place = catalog.place
+        self.config = worker.setup.config
+        self.place = worker.setup.catalog_place
         self.job = job
-        self.setup = setup
+        self.setup = worker.setup
         self._worker = worker
-        self._catalog = catalog
         self._left: TimeLeft | None = None
         self._outline: Outliner | None = None
         self._ranked: list[Ranked] = []
         self._styles = Styles()
-
-    def run(self) -> None:
-        """Run the job to its end; an operator who cancels closes it, and so the torque goes off."""
-        request = self.job.request
-        parameters = {name: value for name, value in request if name != "kind"}
-        with closing(JOBS[type(request)](self, **parameters)) as steps:
-            for step in steps:
-                self._show(step)
 
     # -- what a job needs ---------------------------------------------------------------------------------------------
 
@@ -93,7 +83,7 @@ class ServedDesk(Desk):
         return self
 
     def open_to_read(self) -> Catalog:
-        return self._catalog.open_to_read()
+        return self._worker.catalog.open_to_read()
 
     def choose(self, question: Question) -> Choice:
         queue, job = self._worker.queue, self.job
@@ -116,7 +106,7 @@ class ServedDesk(Desk):
 
     # -- what the pages see -------------------------------------------------------------------------------------------
 
-    def _show(self, step: Step) -> None:
+    def show_step(self, step: Step) -> None:
         match step:
             case Remark(text=text, event=event, steps=steps):
                 self._note(text, as_steps(steps)) if event is None else self.show(event)
@@ -183,6 +173,15 @@ class ServedDesk(Desk):
             worker.wait(job)
         job.state = JobState.RUNNING
         worker.queue.update(job, durable=True)
+
+
+def run_job(worker: BenchWorker, job: Job) -> None:
+    """Run a job to its end; an operator who cancels closes it, and so the torque goes off."""
+    desk, request = ServedDesk(worker, job), job.request
+    parameters = {name: value for name, value in request if name != "kind"}
+    with closing(JOBS[type(request)](desk, **parameters)) as steps:
+        for step in steps:
+            desk.show_step(step)
 
 
 # -- the jobs ----------------------------------------------------------------------------------------------------------

@@ -4,24 +4,32 @@ The worker runs in the main thread of the program, because signals interrupt onl
 the running job and switch the torque off, as in every other command.
 """
 
+import socket
 import threading
+from base64 import b64encode
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
-from rig.bench import Bench
+from pydantic import validate_call
+
+from rig.bench import Bench, open_bench
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
 from rig.core.next_steps import steps_as_json
 from rig.devices.servo import ServoState
 from rig.motion.traces import stored
-from rig.safety.stop_channel import StopAnswer, StopListener
+from rig.safety.saved_state import SERVER_FOLDER
+from rig.safety.stop_channel import StopAnswer, StopListener, listen
 from rig.safety.supervisor import stopped
 from rig.web.jobs import JobQueue
+from rig.web.link import Link
 from rig.web.picture import LivePicture
 from rig.web.problems import problem
 from rig.web.requests import Job, JobState
+from rig.web.setup import BenchCatalog, Setup
 
 IDLE_S: Final = 0.05
 """Time between two checks of the queue."""
@@ -31,6 +39,8 @@ IDLE_STATUS_S: Final = 1.0  # at rest, the state changes by hand or supply only,
 REOPEN_S: Final = 5.0
 """Time after which a bench that could not be opened is opened again."""
 JOBS_WITH_PICTURES: Final = 10  # older jobs keep their events, without pictures
+ASKED: Final = ("jobs", "job", "submit", "cancel", "pause", "resume", "answer")
+"""Functions of the queue that the web process calls."""
 _LOST: Final = (DeviceNotFound, DeviceMismatch, DeviceSilent)
 """After these errors the bench is opened again: a device was unplugged or replaced."""
 
@@ -40,45 +50,106 @@ class JobCancelled(Exception):
 
 
 class BenchWorker:
-    """Runs jobs on one bench.
+    """Runs jobs on one bench, and offers the web process its queue, its events and its pictures.
 
-    ``publish`` sends a message to the listeners, its kind and its JSON values; it must not wait. ``run_job`` runs a job
-    to its end: `rig.web.work.ServedDesk`.
+    ``report`` gets sentences about the catalog for the terminal. ``run_job`` is `rig.web.work.run_job`.
     """
 
     def __init__(
         self,
-        open_bench: Callable[[], Bench],
-        queue: JobQueue,
-        publish: Callable[[str, Any], None],
-        picture: LivePicture,
-        run_job: Callable[["BenchWorker", Job], None],
-        stops: StopListener,
+        setup: Setup,
         clock: SystemClock,
+        report: Callable[[str], None],
+        run_job: Callable[["BenchWorker", Job], None],
     ) -> None:
-        self._open_bench = open_bench
-        self.queue = queue
-        self.publish = publish
-        self._picture = picture
-        self._run_job = run_job
-        self._clock = clock
-        self._bench: Bench | None = None
-        self._error: RigError | None = None
-        """Why the bench is not open."""
-        self._tried_ns: int | None = None
+        def changed(job: Job) -> None:
+            self.publish("job", job)
+
+        def catalog_changed(state: dict[str, Any]) -> None:
+            self.publish("catalog", state)
+
+        self.setup = setup
+        self.catalog = BenchCatalog(setup.catalog_place, clock, catalog_changed, report)
         self.status: dict[str, Any] = {}
         """The last known state of the bench, as JSON values; a new dict after each change."""
-        self._job: Job | None = None
-        self._ended = threading.Event()
-        self._stops = stops
-        self._stops_before = stops.count()
-        """Number of stops before the present job: a further one stops it."""
         self.views: dict[str, list[bytes]] = {}
         """Pictures of the last jobs as JPEG."""
         self.charts: dict[str, str] = {}
         """Charts of the candidates of the last jobs as SVG, after their last view."""
+        self._run_job = run_job
+        self._clock = clock
+        self._link: Link | None = None
+        self._picture = LivePicture(clock)
+        self._bench: Bench | None = None
+        self._error: RigError | None = None
+        """Why the bench is not open."""
+        self._tried_ns: int | None = None
         self._status_ns = 0
-        self.jobs_ended: dict[str, int] = {}
+        self._job: Job | None = None
+        self._ended = threading.Event()
+        self._jobs_ended: Counter[str] = Counter()
+        self._stops: StopListener = listen(setup.state_folder)
+        self._stops_before = self._stops.count()
+        """Number of stops before the present job: a further one stops it."""
+        self.queue = JobQueue(setup.state_folder / SERVER_FOLDER, clock, changed, self._stops.count)
+
+    # -- the web process ----------------------------------------------------------------------------------------------
+
+    def connect(
+        self,
+        connection: socket.socket,
+        ended: Callable[[], None] = lambda: None,
+        alive: Callable[[], None] = lambda: None,
+    ) -> Link:
+        """Return the link to a web process, which gets events from now on, beginning with the present state.
+
+        ``ended`` is called when the process has gone, and ``alive`` at each of its signs of life.
+        """
+        of_queue = (getattr(self.queue, name) for name in ASKED)
+        functions = {
+            **{function.__name__: validate_call(function) for function in of_queue},
+            "view": self._view,
+            "candidates": self._candidates,
+            "picture": self._newest,
+            "numbers": lambda: {"jobs_ended": self._jobs_ended, "stops": self._stops.count()},
+            "last_move": self._last_move,
+            "alive": alive,
+        }
+        self._link = link = Link(connection, functions, ended)
+        link.start()
+        self.publish("status", self.status)
+        return link
+
+    def publish(self, kind: str, data: Any) -> None:
+        """Send a message to the listeners of the web process, if there is one: its kind and its JSON values."""
+        if self._link is not None:
+            self._link.tell("publish", kind=kind, data=data)
+
+    def _view(self, job_id: str, number: int) -> str:
+        pictures = self.views.get(job_id, [])
+        if not 0 <= number < len(pictures):
+            raise JobNotFound("There is no such picture (any more).", next_step="The catalog has all enrolled views.")
+        return b64encode(pictures[number]).decode()
+
+    def _candidates(self, job_id: str) -> str:
+        if job_id not in self.charts:
+            raise JobNotFound("There is no such chart (any more).", next_step="Open the report of the saved run.")
+        return self.charts[job_id]
+
+    def _newest(self, after: int) -> dict[str, Any]:
+        """Return the newest frame, unless its number is ``after``, and ask the camera for more."""
+        self._picture.want()
+        found = self._picture.jpeg() if self._picture.number != after else None
+        number, content = found or (after, b"")
+        return {"number": number, "age_s": self._picture.age_s, "jpeg": b64encode(content).decode()}
+
+    def _last_move(self) -> dict[str, Any]:
+        moves = stored(self._bench.state) if self._bench is not None else []
+        if not moves:
+            raise JobNotFound("The table has not moved yet.", next_step="Rotate it, then ask again.")
+        return moves[-1]
+
+    # -- jobs ---------------------------------------------------------------------------------------------------------
 
     def end(self) -> None:
         """Make `run` return after the present step."""
@@ -97,8 +168,6 @@ class BenchWorker:
             self.close(error)
             raise
         self.close()
-
-    # -- jobs ---------------------------------------------------------------------------------------------------------
 
     def _run(self, job: Job) -> None:
         self._job = job
@@ -129,7 +198,7 @@ class BenchWorker:
             self._error = error
             self.close()
         self.queue.end(job, state, error)
-        self.jobs_ended[state.value] = self.jobs_ended.get(state.value, 0) + 1
+        self._jobs_ended[state.value] += 1
         self._read_status()
 
     def _stopped(self) -> bool:
@@ -180,23 +249,17 @@ class BenchWorker:
         if self._bench is None:
             self._tried_ns = self._clock.now_ns()
             try:
-                bench = self._open_bench()
+                bench = open_bench(self.setup.bench, self.setup.config, seed=self.setup.seed)
             except RigError as error:
                 self._error = error
                 self._read_status()
                 raise
+            bench.camera.observers.append(self._picture.show)
             bench.safety.observers.append(self._observe)
             bench.safety.monitors.append(self._check_stop)
             self._bench, self._error = bench, None
             self._read_status()
         return self._bench
-
-    def last_move(self) -> dict[str, Any]:
-        """Return the trace of the last move as JSON values. Raises `JobNotFound`: there is none."""
-        moves = stored(self._bench.state) if self._bench is not None else []
-        if not moves:
-            raise JobNotFound("The table has not moved yet.", next_step="Rotate it, then ask again.")
-        return moves[-1]
 
     def close(self, error: BaseException | None = None) -> None:
         """Close the bench; ``error`` is why."""
@@ -204,6 +267,10 @@ class BenchWorker:
         if bench is not None:
             with suppress(RigError):  # the fault is latched, and the next opening reports it
                 bench.__exit__(type(error), error, None)
+
+    def close_stops(self) -> None:
+        """End the reception of stops, after `run`."""
+        self._stops.close()
 
     def _idle(self) -> None:
         self._answer_stop()

@@ -157,7 +157,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
     with pytest.MonkeyPatch.context() as patch, starting(folder) as start:
         patch.setattr(BenchWorker, "_idle", wait)
         served = start(*session.get("settings", ()))
-        publish = served.side.worker.publish
+        publish = served.worker.publish
         request: dict[int, str] = {}
 
         def published(kind: str, data: Any) -> None:
@@ -167,7 +167,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
                 if data["event"] == "accepted" and (path := request.pop(data["picture"] + 1, None)):
                     served.client.post(f"/api/v1/jobs/{data['job']}/{path}")
 
-        served.side.worker.publish = published
+        served.worker.publish = published
         for step in session["steps"]:
             values.append({"request": step["job"]})
             request.clear()

@@ -19,10 +19,11 @@ from fastapi.testclient import TestClient
 
 from rig.config import load_config
 from rig.core.clock import SystemClock
-from rig.web.front import guarded, make_server
-from rig.web.run import BenchSide
+from rig.web.front import guarded
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup
+from rig.web.work import run_job
+from rig.web.worker import BenchWorker
 from tests.small import SMALL
 
 ENDED = ("done", "failed", "cancelled", "interrupted")
@@ -32,7 +33,7 @@ ENDED = ("done", "failed", "cancelled", "interrupted")
 class Served:
     """A running server and a client."""
 
-    side: BenchSide
+    worker: BenchWorker
     server: Server
     client: TestClient
     folder: Path
@@ -40,10 +41,10 @@ class Served:
     def opened(self) -> Self:
         """Return the server when its bench is open: before, a stop has no torque to confirm."""
         for _ in range(6000):
-            if self.side.worker.status.get("open"):
+            if self.worker.status.get("open"):
                 return self
             threading.Event().wait(0.01)
-        pytest.fail(f"the bench is not open: {self.side.worker.status}")
+        pytest.fail(f"the bench is not open: {self.worker.status}")
 
     def run(self, **request: Any) -> dict[str, Any]:
         """Submit a job, and return it when it has ended."""
@@ -55,28 +56,28 @@ class Served:
     def wait(self, job_id: str, *states: str) -> dict[str, Any]:
         """Return a job when it has one of the states; by default when it has ended."""
         for _ in range(6000):
-            state = self.side.queue.job(job_id).state  # asking the server takes more computing than the job
+            state = self.worker.queue.job(job_id).state  # asking the server takes more computing than the job
             if state in (states or ENDED):
                 return self.client.get(f"/api/v1/jobs/{job_id}").json()
-            assert state not in ENDED, self.side.queue.job(job_id)
+            assert state not in ENDED, self.worker.queue.job(job_id)
             threading.Event().wait(0.01)
         pytest.fail(f"the job is still {state}")
 
 
-def connected(setup: Setup) -> tuple[BenchSide, Server, Callable[[], None]]:
+def connected(setup: Setup) -> tuple[BenchWorker, Server, Callable[[], None]]:
     """Return the two halves of a server, and a function that ends them; the worker does not run yet."""
-    side = BenchSide(setup, setup.state_folder / "web", SystemClock(), lambda _text: None)
-    server = make_server(setup, SystemClock())
+    worker = BenchWorker(setup, SystemClock(), lambda _text: None, run_job)
     ours, theirs = socket.socketpair()
-    server.remote.connect(theirs)
-    bench_link = side.connect(ours)
+    server = Server(setup, SystemClock(), theirs)
+    server.remote.start()
+    bench_link = worker.connect(ours)
 
     def disconnect() -> None:
-        for link in (server.remote.link, bench_link):
-            link.close()
-        side.close()
+        server.remote.close()
+        bench_link.close()
+        worker.close_stops()
 
-    return side, server, disconnect
+    return worker, server, disconnect
 
 
 @contextmanager
@@ -89,18 +90,18 @@ def starting(folder: Path) -> Iterator[Callable[..., Served]]:
         config = load_config(None, [*folders, f"calibration_dir='{folder}/cal'", *SMALL, *settings])
         listening = Listening(host="127.0.0.1", port=0, needs_login=needs_login, max_upload_bytes=2_000_000)
         setup = Setup(bench="sim", config=config, seed=1, arguments=("--bench", "sim"), listening=listening)
-        side, server, disconnect = connected(setup)
+        worker, server, disconnect = connected(setup)
         client = TestClient(guarded(server), base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
-        thread = threading.Thread(target=side.worker.run, daemon=True)
+        thread = threading.Thread(target=worker.run, daemon=True)
         thread.start()
 
         def end() -> None:
-            side.worker.end()
+            worker.end()
             thread.join(20)
             disconnect()
             assert not thread.is_alive()
 
-        running.append((Served(side, server, client, folder), end))
+        running.append((Served(worker, server, client, folder), end))
         return running[-1][0]
 
     yield start

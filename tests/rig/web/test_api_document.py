@@ -4,6 +4,7 @@
 """
 
 import json
+import socket
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
@@ -14,7 +15,7 @@ from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.events.events import Event, event_dict, event_of
 from rig.web.app import create_app
-from rig.web.front import make_server
+from rig.web.server import Server
 from rig.web.setup import Listening, Setup
 
 KINDS = {next(f.default for f in fields(kind) if f.name == "event") for kind in get_args(Event)}
@@ -25,7 +26,8 @@ PUBLIC = {"get_health", "login", "logout"}
 
 def made() -> dict[str, Any]:
     setup = Setup(bench="sim", config=RigConfig(), listening=Listening(host="127.0.0.1", port=0))
-    return create_app(make_server(setup, SystemClock())).openapi()
+    with socket.socket() as unused:
+        return create_app(Server(setup, SystemClock(), unused)).openapi()
 
 
 @pytest.fixture(scope="module")

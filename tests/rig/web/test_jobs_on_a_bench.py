@@ -51,7 +51,7 @@ def halted(monkeypatch) -> Halted:
         bench.safety.observers.append(observe)
         return bench
 
-    monkeypatch.setattr("rig.web.run.open_bench", opened)
+    monkeypatch.setattr("rig.web.worker.open_bench", opened)
     return halt
 
 
@@ -131,7 +131,7 @@ def stops_of(served: Served, number: int) -> list[dict[str, Any]]:
 
 def test_job_that_meets_an_interrupted_enrollment_offers_to_continue_it(serve):
     served = serve()
-    worker = served.side.worker
+    worker = served.worker
     publish = worker.publish
 
     def published(kind: str, data: Any) -> None:
@@ -204,7 +204,7 @@ def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(ser
     file = tmp_path / "state" / "sim" / "web" / "jobs.json"
     jobs = json.loads(file.read_text())
     jobs[0] |= {"state": "running", "ended_utc": None, "result": None, "views": 3}
-    served.side.worker.end()
+    served.worker.end()
     file.write_text(json.dumps(jobs))
     again = serve()
     (job,) = again.client.get("/api/v1/jobs").json()["items"]
@@ -239,7 +239,7 @@ def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
 
     def watched(*arguments: Any) -> Any:
         for finding in run_checks(*arguments):
-            closed.append(served.side.worker._bench is None)
+            closed.append(served.worker._bench is None)
             yield finding
 
     monkeypatch.setattr("rig.doctor.examination.run_checks", watched)
@@ -256,7 +256,7 @@ def test_doctor_examines_a_bench_that_cannot_be_opened(serve, monkeypatch):
     def missing(*_arguments: Any, **_options: Any) -> Bench:
         raise DeviceNotFound("The camera is missing.", next_step="Connect it.")
 
-    monkeypatch.setattr("rig.web.run.open_bench", missing)
+    monkeypatch.setattr("rig.web.worker.open_bench", missing)
     served = serve()
     assert served.run(kind="home")["error"]["what"] == "The camera is missing."
     assert served.run(kind="doctor")["state"] == "done"
@@ -288,10 +288,10 @@ def test_server_that_ends_in_a_job_stores_how_it_ended(tmp_path, monkeypatch, er
     monkeypatch.setattr("rig.web.work.page_line", fail)
     config = load_config(None, [f"catalog.path={tmp_path}/catalog", f"state_dir={tmp_path}/state"])
     setup = Setup(bench="sim", config=config, listening=Listening(host="127.0.0.1", port=0))
-    side, _, disconnect = connected(setup)
-    job = side.queue.submit(GotoRequest(angle_deg=30), "anna")
+    worker, _, disconnect = connected(setup)
+    job = worker.queue.submit(GotoRequest(angle_deg=30), "anna")
     with pytest.raises(type(error)):
-        side.worker.run()
+        worker.run()
     disconnect()
-    assert side.queue.job(job.id).state == state
+    assert worker.queue.job(job.id).state == state
     assert json.loads((setup.state_folder / SESSION).read_text())["ended"] == session

@@ -53,7 +53,7 @@ def motion(monkeypatch: pytest.MonkeyPatch) -> Motion:
         motion.watch(bench)
         return bench
 
-    monkeypatch.setattr("rig.web.run.open_bench", opened)
+    monkeypatch.setattr("rig.web.worker.open_bench", opened)
     return motion
 
 
@@ -74,13 +74,13 @@ def request_stop(served: Served) -> StopRequest:
 
 
 def table_deg(served: Served) -> float:
-    return float(served.side.worker.status["table_deg"])
+    return float(served.worker.status["table_deg"])
 
 
 def all_cancelled(served: Served) -> None:
-    first = served.side.queue.jobs()[-1]
+    first = served.worker.queue.jobs()[-1]
     assert served.wait(first.id)["state"] == "cancelled"
-    jobs = served.side.queue.jobs()
+    jobs = served.worker.queue.jobs()
     assert {job.state for job in jobs} == {"cancelled"}
     assert [job.id for job in jobs if job.started_utc is not None] == [first.id]
     assert 20.0 < table_deg(served) < 340.0
@@ -97,7 +97,7 @@ def test_rig_stop_cancels_the_queue_and_no_waiting_job_begins(moving):
 def test_job_that_waits_never_begins_although_the_stop_was_not_noticed_yet(serve, motion):
     """The stop arrives after the running job has ended and before the next one begins."""
     served = serve()
-    queue, began = served.side.queue, threading.Event()
+    queue, began = served.worker.queue, threading.Event()
     usual = queue.end
 
     def end(job: Any, *arguments: Any) -> None:
@@ -118,7 +118,7 @@ def test_job_that_waits_never_begins_although_the_stop_was_not_noticed_yet(serve
 
 def test_stop_does_not_wait_for_the_queue_and_its_disk(moving):
     """Another thread stores the jobs on a disk that does not answer."""
-    queue, held, free = moving.side.queue, threading.Event(), threading.Event()
+    queue, held, free = moving.worker.queue, threading.Event(), threading.Event()
 
     def store() -> None:
         with queue._lock:
@@ -222,7 +222,7 @@ def test_stop_during_a_pause_within_a_search_holds_the_cable_budget(serve):
     served = serve("bench.sim.object='mug-white'", *known)
     for name in ("mug-white", "mug-star"):
         assert served.run(kind="enroll", name=name, views=6)["state"] == "done"
-    worker = served.side.worker
+    worker = served.worker
     publish, moved = worker.publish, []
 
     def published(kind: str, data: Any) -> None:
