@@ -54,7 +54,7 @@ def run_server(setup: Setup, ready: Callable[[str], None]) -> None:
     lock = BenchLock(folder, clock)  # one server for each bench
     set_priority(BENCH_NICE)
     try:
-        worker = BenchWorker(setup, clock, print_note, run_job)
+        worker = BenchWorker(setup, clock, run_job)
         with _socket(listening) as connection:
             web = WebProcess(worker, connection, clock)
             try:

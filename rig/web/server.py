@@ -14,18 +14,59 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.security import APIKeyCookie, HTTPBearer
 from starlette.requests import HTTPConnection
 
-from rig.core.clock import SystemClock
+from rig.catalog import Catalog
+from rig.catalog.copying import Attempts, open_or_copy
+from rig.catalog.journal import BackgroundDelivery, JournalState
+from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import Clock, SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions, Tokens
 from rig.web.hub import Hub
 from rig.web.link import RemoteBench
-from rig.web.setup import BenchCatalog, Setup, print_note
+from rig.web.setup import Setup, print_note
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"
 MAX_PAGE: Final = 500  # larger: a list holds the process that receives STOP for longer
+
+
+class BenchCatalog:
+    """The catalog of a bench for requests, even while its server does not answer; its state goes to the listeners."""
+
+    def __init__(self, place: CatalogPlace, clock: Clock, hub: Hub) -> None:
+        self.state: dict[str, Any] = {"local_copy_utc": None, "waiting": 0, "reasons": []}
+        self._place = place
+        self._clock = clock
+        self._hub = hub
+        self._attempts = Attempts(clock)
+
+    def open_to_read(self) -> Catalog:
+        """Open the catalog, or its local copy; a catalog that does not exist yet is created."""
+        create = not self._place.may_exist()
+        catalog = open_or_copy(self._place, self._clock, create=create, attempts=self._attempts)
+        copied = catalog.copied_utc
+        self._become(local_copy_utc=None if copied is None else f"{copied:%Y-%m-%d %H:%M:%S} UTC")
+        return catalog
+
+    def open_to_change(self) -> Catalog:
+        """Open the catalog to change its objects; a `CatalogUnavailable` if its server does not answer."""
+        return Catalog.open(self._place, clock=self._clock)
+
+    def background_delivery(self) -> BackgroundDelivery:
+        """Return a delivery of the journal during the work of a ``with`` block; notes on stderr say what it did."""
+
+        def show(state: JournalState) -> None:
+            self._become(waiting=state.waiting, reasons=list(state.reasons))
+
+        return BackgroundDelivery(self._place, self._clock, print_note, changed=show)
+
+    def _become(self, **values: Any) -> None:
+        state = {**self.state, **values}
+        if state != self.state:
+            self.state = state
+            self._hub.publish("catalog", state)
 
 
 class Server:
@@ -39,18 +80,10 @@ class Server:
     ) -> None:
         self.setup = setup
         self.hub = Hub(secrets.token_hex(4))
-        self.remote = RemoteBench(connection, setup.state_folder, clock, self._received, ended)
+        self.remote = RemoteBench(connection, setup.state_folder, clock, self.hub.publish, ended)
         self.sessions = Sessions(Tokens(setup.state_folder / SERVER_FOLDER, clock), clock, setup.local_token)
         self.lease = Lease(clock, lambda values: self.hub.publish("lease", values))
-        self.catalog = BenchCatalog(
-            setup.catalog_place, clock, lambda state: self.hub.publish("catalog", state), print_note
-        )
-
-    def _received(self, kind: str, data: Any) -> None:
-        if kind == "catalog":
-            self.catalog.become(data)  # which publishes it
-        else:
-            self.hub.publish(kind, data)
+        self.catalog = BenchCatalog(setup.catalog_place, clock, self.hub)
 
     def person(self, request: HTTPConnection) -> Person | None:
         """Return the sender of a request; None if it is not known.

@@ -10,7 +10,9 @@ from pydantic import BaseModel
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
+from rig.catalog.copying import open_or_copy
 from rig.charts.candidates import Styles, candidates_chart
+from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 from rig.core.next_steps import NextSteps, as_steps, steps_as_json
 from rig.core.plugins import plugins
@@ -83,7 +85,8 @@ class ServedDesk(Desk):
         return self
 
     def open_to_read(self) -> Catalog:
-        return self._worker.catalog.open_to_read()
+        create = not self.place.may_exist()
+        return open_or_copy(self.place, SystemClock(), create=create, attempts=self._worker.attempts)
 
     def choose(self, question: Question) -> Choice:
         queue, job = self._worker.queue, self.job

@@ -15,6 +15,7 @@ from typing import Any, Final
 from pydantic import validate_call
 
 from rig.bench import Bench, open_bench
+from rig.catalog.copying import Attempts
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
@@ -29,7 +30,7 @@ from rig.web.link import Link
 from rig.web.picture import LivePicture
 from rig.web.problems import problem
 from rig.web.requests import Job, JobState
-from rig.web.setup import BenchCatalog, Setup
+from rig.web.setup import Setup
 
 IDLE_S: Final = 0.05
 """Time between two checks of the queue."""
@@ -52,24 +53,21 @@ class JobCancelled(Exception):
 class BenchWorker:
     """Runs jobs on one bench, and offers the web process its queue, its events and its pictures.
 
-    ``report`` gets sentences about the catalog for the terminal. ``run_job`` is `rig.web.work.run_job`.
+    ``run_job`` is `rig.web.work.run_job`.
     """
 
     def __init__(
         self,
         setup: Setup,
         clock: SystemClock,
-        report: Callable[[str], None],
         run_job: Callable[["BenchWorker", Job], None],
     ) -> None:
         def changed(job: Job) -> None:
             self.publish("job", job)
 
-        def catalog_changed(state: dict[str, Any]) -> None:
-            self.publish("catalog", state)
-
         self.setup = setup
-        self.catalog = BenchCatalog(setup.catalog_place, clock, catalog_changed, report)
+        self.attempts = Attempts(clock)
+        """Those to open the catalog."""
         self.status: dict[str, Any] = {}
         """The last known state of the bench, as JSON values; a new dict after each change."""
         self.views: dict[str, list[bytes]] = {}

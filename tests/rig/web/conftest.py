@@ -66,7 +66,7 @@ class Served:
 
 def connected(setup: Setup) -> tuple[BenchWorker, Server, Callable[[], None]]:
     """Return the two halves of a server, and a function that ends them; the worker does not run yet."""
-    worker = BenchWorker(setup, SystemClock(), lambda _text: None, run_job)
+    worker = BenchWorker(setup, SystemClock(), run_job)
     ours, theirs = socket.socketpair()
     server = Server(setup, SystemClock(), theirs)
     server.remote.start()
