@@ -82,7 +82,6 @@ def add_bench(routes: Routes, server: Server) -> None:
             "bench": server.setup.bench,
             "server": {"listeners": server.hub.listeners},
             "catalog": server.catalog.state,
-            "problem": server.remote.status.get("problem"),
         }
 
     @routes.watch.post("/stop", tags=["bench"], response_model=Stopped)

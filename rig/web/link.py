@@ -173,7 +173,7 @@ class RemoteBench(Link):
         self._state_folder = state_folder
         self._clock = clock
         self._take = received
-        self.status: dict[str, Any] = {"open": False, "job": None, "error": None}
+        self.status: dict[str, Any] = {"open": False, "job": None, "error": None, "problem": None}
         """The last known state of the bench."""
         self._newest: tuple[int, bytes] = (0, b"")
         self._age_s: float | None = None

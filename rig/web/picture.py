@@ -1,6 +1,5 @@
 """Pictures for the pages: the newest frame, and the outline of the object in a view."""
 
-import threading
 from typing import Final
 
 import cv2
@@ -24,19 +23,18 @@ class LivePicture:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._lock = threading.Lock()
-        self._image: NDArray[np.uint8] | None = None
-        self.number = 0
-        """Number of the newest frame, from 1; 0 if there is none."""
-        self._shown_ns: int | None = None
+        self._frame: tuple[int, NDArray[np.uint8], int] | None = None
+        """Number, image and time of the newest frame: replaced as one, because two threads use it."""
         self._wanted_until_ns = 0
+
+    @property
+    def number(self) -> int:
+        """Number of the newest frame, from 1; 0 if there is none."""
+        return 0 if self._frame is None else self._frame[0]
 
     def show(self, image_bgr: NDArray[np.uint8]) -> None:
         """Replace the picture, from the bench's thread; the array must not be changed afterwards."""
-        with self._lock:
-            self._image = image_bgr
-            self.number += 1
-            self._shown_ns = self._clock.now_ns()
+        self._frame = (self.number + 1, image_bgr, self._clock.now_ns())
 
     def want(self) -> None:
         """Ask for pictures from an idle camera for the next five seconds."""
@@ -49,13 +47,12 @@ class LivePicture:
     @property
     def age_s(self) -> float | None:
         """Age of the newest frame in seconds; None if there is none."""
-        return None if self._shown_ns is None else seconds_between(self._shown_ns, self._clock.now_ns())
+        return None if self._frame is None else seconds_between(self._frame[2], self._clock.now_ns())
 
     def jpeg(self) -> tuple[int, bytes] | None:
         """Return the number of the newest frame and the frame as JPEG; None if there is none yet."""
-        with self._lock:
-            number, image = self.number, self._image
-        return None if image is None else (number, jpeg(image))
+        frame = self._frame
+        return None if frame is None else (frame[0], jpeg(frame[1]))
 
 
 def jpeg(image_bgr: NDArray[np.uint8], max_side_px: int = MAX_SIDE_PX) -> bytes:

@@ -109,7 +109,7 @@ def identifying(
 
 
 def searching_densely(
-    answer: str | None = "mug-star", rotations_deg: Sequence[float] = (80.0, -115.0), *, pair: bool = True
+    answer: str | None = "mug-star", rotations_deg: Sequence[float] = (80.0, -115.0)
 ) -> Iterator[Event]:
     """Yield a dense search with these rotations, which distinguish the first two of `NAMES` best."""
     rng = np.random.default_rng(6)
@@ -135,12 +135,11 @@ def searching_densely(
                 possible_deg,
                 tuple(-8.0 + a / 30 for a in away),
                 tuple(0.02 + abs(rotation) / 4500 for rotation in possible_deg),
-                tuple(0.5 + a / 400 for a in away) if pair else None,
+                tuple(0.5 + a / 400 for a in away),
             )
-            reason = RotationReason.SEPARATES_CANDIDATES if pair else RotationReason.NEW_SIDE
+            reason = RotationReason.SEPARATES_CANDIDATES
             side, target_deg = "left" if step_deg >= 0 else "right", -orientation_deg - step_deg
-            names = NAMES[:2] if pair else ()
-            yield Decided(k, side, step_deg, target_deg, None, None, names, reason, weighed=weighed)
+            yield Decided(k, side, step_deg, target_deg, None, None, NAMES[:2], reason, weighed=weighed)
     yield Identified(
         answer,
         candidates,
