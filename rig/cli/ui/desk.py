@@ -13,7 +13,7 @@ from rig.catalog.journal import BackgroundDelivery, waiting
 from rig.cli.ui import prompts
 from rig.cli.ui.present import ProgressBar
 from rig.cli.ui.settings import Settings
-from rig.core.clock import Clock, SystemClock
+from rig.core.clock import SystemClock
 from rig.core.next_steps import in_words
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
@@ -28,11 +28,10 @@ class CommandDesk(Desk):
     ``before`` is called before each question and each note: it removes the live display. ``yes`` asks nothing;
     ``with_json`` asks at a terminal also with ``--json``, because a person must do something.
 
-    ``bench`` and ``catalog`` are those that the job has opened.
+    ``bench`` is the one that the job has opened.
     """
 
     bench: Bench
-    catalog: Catalog
 
     def __init__(
         self,
@@ -58,10 +57,6 @@ class CommandDesk(Desk):
         if self.place.url is None:
             return self._settings.open_catalog(read_only=True)
         return open_or_copy(self.place, SystemClock())
-
-    def open_to_enroll(self, clock: Clock) -> Catalog:
-        self.catalog = super().open_to_enroll(clock)
-        return self.catalog
 
     def deliver_waiting(self) -> None:
         """Deliver the journal if something is in it."""
