@@ -105,11 +105,12 @@ def support_bundle(
     file: Path | None,
     bench: str | None,
     open_catalog: Callable[[], Catalog],
+    trace: Callable[[], bytes] | None = None,
 ) -> bytes:
     """Return a ZIP file for a person who helps without seeing the bench: findings, log, configuration and versions.
 
-    Passwords and tokens are masked. What cannot be read is left out; the list ``missing`` in ``versions.json`` has the
-    reason.
+    ``trace`` records one for it. Passwords and tokens are masked. What cannot be read is left out; the list ``missing``
+    in ``versions.json`` has the reason.
     """
 
     def log() -> bytes:
@@ -127,6 +128,8 @@ def support_bundle(
     }
     if file is not None:
         parts["rig.toml"] = lambda: str(masked(file.read_text("utf-8"))).encode()
+    if trace is not None:
+        parts["trace.jsonl"] = trace
     contents: dict[str, bytes] = {"findings.json": _masked_json(findings)}
     missing: list[str] = []
     for name, read in parts.items():

@@ -1,10 +1,13 @@
 """`rig doctor`, `rig find` and `rig setup`: the bench to check, its devices, its findings."""
 
+import json
 import sys
+from collections import deque
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any, Final, TextIO
 
@@ -15,7 +18,7 @@ from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
-from rig.core.errors import UsageError, os_errors_as
+from rig.core.errors import RigError, UsageError, os_errors_as
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,6 +43,10 @@ def doctor(
             help="Also write a support bundle: findings, log, configuration and versions.",
         ),
     ] = None,
+    trace: Annotated[
+        bool,
+        typer.Option("--trace", help="Add what the devices send when they are opened, as rig servo record --still."),
+    ] = False,
 ) -> None:
     """Check everything that the bench needs. Print one finding per line, and a fix for each problem.
 
@@ -57,6 +64,8 @@ def doctor(
         return
     if bundle is not None:
         check_new(bundle, ".zip")
+    elif trace:
+        raise UsageError("--trace needs a bundle.", next_step="Add --bundle FILE.zip.")
     found = print_findings(settings)
     if bundle is not None:
         packed = support_bundle(
@@ -65,11 +74,29 @@ def doctor(
             settings.config or default_path(),
             settings.bench,
             partial(settings.open_catalog, read_only=True),
+            partial(still_trace, settings) if trace else None,
         )
         write_new(bundle, packed)
         print(f"Support bundle: {bundle}. Look through it before you send it.", file=sys.stderr)
     if found["exit_code"]:
         raise typer.Exit(found["exit_code"])
+
+
+def still_trace(settings: Settings) -> bytes:
+    """Return a trace for which nothing moves; if a device fails, it ends there."""
+    from rig.cli.ui.desk import CommandDesk
+    from rig.jobs.trace import record
+
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "trace.jsonl"
+        try:
+            deque(
+                record(CommandDesk(settings.merged(overrides=[f"trace={json.dumps(str(file))}"])), still=True), maxlen=0
+            )
+        except RigError:
+            if not file.exists():
+                raise
+        return file.read_bytes()
 
 
 def print_findings(settings: Settings) -> dict[str, Any]:

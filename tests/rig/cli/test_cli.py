@@ -104,11 +104,13 @@ def test_snapshot_is_written_once(rig):
 
 def test_doctor_writes_a_support_bundle(rig):
     rig("goto", "10")
-    assert rig("doctor", "--bundle", "a.zip").exit_code == 0
+    assert rig("doctor", "--trace").exit_code == 2
+    assert rig("doctor", "--bundle", "a.zip", "--trace").exit_code == 0
     with ZipFile("a.zip") as bundle:
         assert set(bundle.namelist()) >= {"findings.json", "configuration.json", "versions.json", "state.json"}
         findings = json.loads(bundle.read("findings.json"))
         assert {finding["topic"] for finding in findings} >= {"servo", "imu", "camera"}
+        assert b'"reply":' in bundle.read("trace.jsonl")
         versions = json.loads(bundle.read("versions.json"))
         assert versions["packages"]["numpy"] == np.__version__
         assert any(text.startswith("log.json: ") for text in versions["missing"])  # there is no catalog yet
