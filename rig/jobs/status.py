@@ -1,32 +1,44 @@
-"""The job of `rig status`: the state of a bench and of its devices, also if a server uses it."""
+"""The job of `rig status`: the state of a bench and of its devices, also if it is served, or some are missing."""
 
 import json
 import ssl
 from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
 from rig.bench import Bench
-from rig.core.errors import BenchBusy, RigError
+from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
 from rig.core.json_form import plain
 from rig.core.next_steps import Do, steps_as_json
 from rig.devices.camera import Camera
-from rig.devices.imu import Imu
+from rig.devices.imu import Imu, open_imu
+from rig.doctor.camera import open_camera
+from rig.doctor.context import DoctorContext
 from rig.safety.saved_state import ServerAddress, server_address
 
 
-def bench_report(state_path: Path, open_bench: Callable[[], Bench]) -> dict[str, Any]:
+def bench_report(
+    state_path: Path, open_bench: Callable[[], Bench], open_parts: Callable[[], AbstractContextManager[DoctorContext]]
+) -> dict[str, Any]:
     """Return the state of a bench, as JSON values; nothing moves.
 
-    ``state_path`` tells whether a server uses it. ``open_bench`` opens it, but none of its devices except the servo.
+    ``state_path`` tells whether a server uses it. ``open_bench`` opens it, but none of its devices except the servo;
+    ``open_parts`` opens its other devices, if the servo does not work.
 
-    Raises `RigError`: the server does not answer, or the bench cannot be opened.
+    Raises `RigError`: the server does not answer, or the bench cannot be opened for another reason than a missing
+    servo.
     """
     if server := server_address(state_path):
         return _report_of_server(server)
-    with open_bench() as bench:
+    try:
+        bench = open_bench()
+    except (DeviceNotFound, DeviceMismatch, DeviceSilent) as missing:
+        with open_parts() as context:
+            return _report_without_servo(context, missing)
+    with bench:
         return _report_of(bench)
 
 
@@ -46,6 +58,25 @@ def _report_of(bench: Bench) -> dict[str, Any]:
     }
     steps = steps_as_json(safety.next_step or bench.calibration_steps)
     return {**report, "findings": list(bench.findings), "steps": steps}  # opening the camera adds some findings
+
+
+def _report_without_servo(context: DoctorContext, missing: RigError) -> dict[str, Any]:
+    config, computer = context.config, context.computer
+
+    def imu() -> dict[str, Any]:
+        with closing(open_imu(config.imu, computer.i2c_path(config.imu.bus), computer.clock)) as sensor:
+            return _imu_values(sensor)
+
+    def camera() -> dict[str, Any]:
+        with closing(open_camera(context)) as opened:
+            return _camera_values(opened)
+
+    return {
+        "bench": context.bench,
+        "servo": {"error": missing.as_dict()},
+        **({"imu": _read(imu)} if config.imu.connection == "i2c" else {}),
+        "camera": _read(camera),
+    }
 
 
 def _report_of_server(server: ServerAddress) -> dict[str, Any]:

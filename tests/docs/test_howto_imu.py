@@ -47,7 +47,7 @@ def test_search_and_doctor_name_the_new_imu():
     with unopened(CHOSEN) as bench:
         (found,) = scan_imus(bench.context.computer, 1)
         (candidate,) = DeviceScan(imus=[found]).candidates["IMU"]
-        assert candidate.settings == {("imu", "model"): "lsm6dsox", ("imu", "bus"): 1, ("imu", "address"): 0x6A}
+        assert candidate == {("imu", "model"): "lsm6dsox", ("imu", "bus"): 1, ("imu", "address"): 0x6A}
         assert not bench.problems("imu")
         bench.devices.i2c.detach(0x6A)
         bench.devices.i2c.attach(0x6A, SimMpu6050(bench.devices.world))

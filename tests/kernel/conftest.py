@@ -80,7 +80,7 @@ def first_day(guest: GuestBench) -> FirstDay:
     guest.sh(f"tee {' '.join(RULES_FILES)} >/dev/null <<'END'\n{rules.output}END\n{trigger}")
     brltty_after = guest.sh(wants)
     after, link = guest.files(latency)[latency].strip(), guest.sh("readlink -f /dev/rig-servo")
-    setup = guest.rig("setup", "--yes")
+    setup = guest.rig("setup")
     added = (f"s/^\\[{section}\\]/" + "\\n".join((f"[{section}]", *lines)) + "/" for section, lines in PATIENT.items())
     guest.sh(f"sed -i '{'; '.join(added)}' rig.toml")
     settings, home = guest.rig("servo", "settings", "--write", "--yes"), guest.rig("home", "--here")

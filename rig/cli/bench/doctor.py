@@ -177,12 +177,12 @@ def setup(settings: Settings) -> None:
         if not settings.bench and not settings.json:
             print("These devices are simulated. For the real bench: rig setup --bench hardware")
     wanted["default_bench",] = bench
-    changes = {key: value for key, value in wanted.items() if _at(stored, key) != value}
+    changes = {key: value for key, value in wanted.items() if not there or _at(stored, key) != value}
     new = with_values(read_text(path) if there else blank_file(RigConfig), changes)
     if changes or not there:
         save(path, new)
-    lines = [f"Wrote {path}:" if changes or not there else f"{path} is unchanged."]
-    lines += [f"  {'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
+    lines = [f"  {'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
+    lines.append(f"Wrote {path}." if changes or not there else f"{path} is unchanged.")
     written = {".".join(key): value for key, value in changes.items()}
     settings.say("\n".join([*lines, ""]), {"path": path, "written": bool(changes) or not there, "settings": written})
     if code := print_findings(replace(settings))["exit_code"]:  # a copy reads the file again

@@ -11,9 +11,10 @@ from rig.doctor.camera import lock_words
 
 def report_lines(report: Mapping[str, Any]) -> Iterator[str]:
     """Yield a report in lines; of a bench that a server uses, without its devices."""
-    page = report.get("page")
-    yield f"bench    {report['bench']}{f', served at {page}' if page else ''}"
-    yield f"state    {_state_words(report)}"
+    page, is_open = report.get("page"), "state" in report
+    yield f"bench    {report['bench']}{f', served at {page}' if page else '' if is_open else ': not open'}"
+    if is_open or page:
+        yield f"state    {_state_words(report)}"
     if problem := report.get("error"):
         yield f"error    {problem['code']}: {problem['what']}"
         yield f"         Next step: {problem['next_step']}"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from rig.cli.bench.doctor import doctor_context
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.settings import Settings
@@ -76,7 +77,7 @@ def home(
 
 @command
 def status(settings: Settings) -> None:
-    """Show the state of the bench and its devices. Moves nothing.
+    """Show the state of the bench and its devices, even if some of them are missing. Moves nothing.
 
     Example: rig status --bench sim --json
     """
@@ -86,9 +87,10 @@ def status(settings: Settings) -> None:
     report = bench_report(
         settings.load().state_path(settings.bench_name),
         partial(settings.open_bench, tell=False, devices=()),
+        partial(doctor_context, settings),
     )
     settings.say("\n".join(report_lines(report)), report)
-    for device in ("imu", "camera"):  # the exit code is that of the first device that does not work
+    for device in ("servo", "imu", "camera"):  # the exit code is that of the first device that does not work
         if error := report.get(device, {}).get("error"):
             raise typer.Exit(error["code"] // 100)
 

@@ -76,12 +76,12 @@ def test_status_reports_the_devices(rig):
     assert re.search(r"camera   camera 0 \(.*\), 320x240 at .*\n +exposure 10 ms, .* gain 0", text)
 
 
-@pytest.mark.parametrize("device", ["imu", "camera"])
+@pytest.mark.parametrize("device", ["servo", "imu", "camera"])
 def test_status_shows_the_other_devices_if_one_is_missing(rig, device):
     missing = ("--set", f'bench.sim.faults=["{device}.off"]')
     done = rig("status", "--json", *missing)
     result = json.loads(done.stdout)
-    broken = [name for name in ("imu", "camera") if "error" in result[name]]
+    broken = [name for name in ("servo", "imu", "camera") if "error" in result[name]]
     assert (broken, done.exit_code) == ([device], 4)
     assert result[device]["error"]["code"] // 100 == 4
     assert f"{device:8s} error 40" in rig("status", *missing).stdout

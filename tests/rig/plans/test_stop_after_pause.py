@@ -1,7 +1,7 @@
 """An enrollment that was paused and then stopped: cable budget, torque, stored angle, and how it continues.
 
 The plan pauses while its consumer does not ask for the next event. `tests/rig/search/test_arc_search.py` has the same
-for a search in motion, `tests/rig/cli/ui/test_live.py` the keys of the terminal.
+for a search in motion, `tests/rig/cli/ui/test_live.py` Ctrl+Z at the terminal.
 """
 
 from collections.abc import Callable

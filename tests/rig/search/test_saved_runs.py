@@ -3,9 +3,12 @@
 import json
 import os
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -16,6 +19,9 @@ from rig.core.errors import UsageError
 from rig.events.events import (
     Accepted,
     Decided,
+    Identified,
+    Ranked,
+    Started,
     event_dict,
 )
 from rig.search.model import model_of
@@ -133,6 +139,66 @@ def test_damaged_run_is_rejected(saved, tmp_path, name, content, words):
 def spoiled(saved, tmp_path: Path, strategy: str = "ahbr") -> Path:
     """Return a copy of a run."""
     return Path(shutil.copytree(saved[strategy][0], tmp_path / "spoiled"))
+
+
+def png(width: int, height: int) -> bytes:
+    return cv2.imencode(".png", np.zeros((height, width, 3), np.uint8))[1].tobytes()
+
+
+def huge_png(side: int) -> bytes:
+    """Return a PNG whose header promises more pixels than the file has."""
+    content = bytearray(png(4, 4))
+    content[16:24] = struct.pack(">II", side, side)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    return bytes(content)
+
+
+@pytest.mark.parametrize("frame", [b"", png(1, 1), png(320, 1), png(239, 239), huge_png(60_000), huge_png(19_000)])
+@pytest.mark.parametrize(("strategy", "name"), [("ahbr", "frames/000.png"), ("dense", "empty_table.png")])
+def test_frame_of_another_size_is_reported_as_damage(saved, tmp_path, frame, strategy, name):
+    folder = spoiled(saved, tmp_path, strategy)
+    (folder / name).write_bytes(frame)
+    try:
+        assert check(load_run(folder)).differences
+    except UsageError as error:
+        assert error.next_step  # noqa: PT017
+
+
+SPOILED_EVENTS = {
+    "negative seed": (Started, {"seed": -1}),
+    "seed of text": (Started, {"seed": "1"}),
+    "azimuth unknown": (Accepted, {"azimuth_deg": None}),
+    "azimuth beyond numbers": (Accepted, {"azimuth_deg": 10**400}),
+    "azimuth is true": (Accepted, {"azimuth_deg": True}),
+    "index is a path": (Accepted, {"index": "../../frames/000"}),
+    "evidence is a list": (Accepted, {"evidence": []}),
+    "no candidates": (Identified, {"candidates": []}),
+    "candidates of lists": (Ranked, {"candidates": [[]]}),
+    "candidates is a number": (Ranked, {"candidates": 3}),
+    "conditions is a list": (Started, {"strategy": []}),
+}
+
+
+@pytest.mark.parametrize(("kind", "values"), SPOILED_EVENTS.values(), ids=SPOILED_EVENTS)
+def test_invalid_event_is_reported_as_damage(saved, tmp_path, kind, values):
+    with pytest.raises(UsageError) as caught:
+        check(load_run(changed(saved, tmp_path, place(saved, kind), **values)))
+    assert caught.value.evidence["reason"]
+    assert "Error" not in caught.value.evidence["reason"]
+
+
+@pytest.mark.parametrize("name", ["run.json", "model.jsonl", "events.jsonl"])
+@pytest.mark.parametrize(
+    "content", [b"[]\n", b"3\n", b"null\n", b"[" * 100_000, b'{"event": NaN}\n', b"9" * 5000 + b"\n"]
+)
+def test_json_of_another_kind_is_damage(saved, tmp_path, name, content):
+    folder = spoiled(saved, tmp_path)
+    (folder / name).write_bytes(content)
+    try:
+        assert not check(load_run(folder)).is_complete
+    except UsageError as error:
+        assert error.evidence["reason"]  # noqa: PT017
+        assert "Error" not in error.evidence["reason"]  # noqa: PT017
 
 
 def test_run_opens_no_file_outside_its_folder(saved, tmp_path):
