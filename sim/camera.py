@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from math import ceil, cos, radians, sin
 from threading import get_ident
-from typing import Any, Protocol
+from typing import Any
 from zlib import crc32
 
 import cv2
@@ -439,13 +439,7 @@ _OPAQUE = 104  # an object's pixels differ by less on the two grounds; those of 
 # -- after a hard change of the bench: the drawn object on a bench of `rig eval` ---------------------------------------
 
 
-class DrawFunction(Protocol):
-    """A function that draws an object into an image, uint8 (480, 640, 3)."""
-
-    def __call__(self, image: Image, /) -> None: ...
-
-
-def seen_on_visit(visit: Visit, draw: DrawFunction | None, table_deg: float) -> Image:
+def seen_on_visit(visit: Visit, draw: Callable[[Image], None] | None, table_deg: float) -> Image:
     """Return the camera's image under nominal light, uint8 (480, 640, 3); without an object, the empty table.
 
     The object is cut out by drawing it on a dark and on a bright ground. The bench is drawn at half the size.

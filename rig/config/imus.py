@@ -29,7 +29,7 @@ class ImuKind:
     register, identities : int, tuple of int
         The register that identifies the sensor, and its values.
     driver : str
-        ``module:callable`` that opens the sensor, see `rig.devices.imu.ImuDriver`; empty if there is no driver.
+        ``module:callable`` that opens the sensor and returns an `rig.devices.imu.Imu`; empty if there is no driver.
     simulator : str
         ``module:callable``, which takes the world and ``address``, and returns a `sim.imu.inertial.SimulatedImu`.
     settings : tuple of str

@@ -1,8 +1,9 @@
 """The interface of an inertial sensor on the platter, what its drivers share, and opening the configured one."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,12 +102,6 @@ class FifoTimes:
         return time_ns
 
 
-class ImuDriver(Protocol):
-    """Opens the sensor of a row of `rig.config.imus`; ``settings`` are the address and the row's settings by name."""
-
-    def __call__(self, bus: AnyBus, *, clock: Clock, **settings: Any) -> Imu: ...
-
-
 def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_rthz: float) -> ImuIdentity:
     """Return the identity of a sensor whose identity register has the value ``got``.
 
@@ -139,7 +134,7 @@ def open_imu(config: ImuConfig, bus: AnyBus, clock: Clock) -> Imu:
     """
     kind = imu_kind(config.model)
     try:
-        driver: ImuDriver = resolve_name(kind.driver)
+        driver: Callable[..., Imu] = resolve_name(kind.driver)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
             f"The driver {kind.driver} of the {kind.name} cannot be loaded.",

@@ -9,7 +9,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from rig.core.clock import seconds_between
 from rig.core.errors import UsageError
 from sim.clock import VirtualClock
 from sim.devices import SimDevices
@@ -88,20 +87,3 @@ def repeatedly(clock: VirtualClock, period_s: float, action: Callable[[], None])
     """Call ``action`` now and every ``period_s`` from now on; return the function that stops it."""
     action()
     return clock.every(period_s, action)
-
-
-class Delay:
-    """Delays values by a time on the clock."""
-
-    def __init__(self, clock: VirtualClock, seconds: float) -> None:
-        self._clock = clock
-        self._seconds = seconds
-        self._values: list[tuple[int, bytes]] = []
-
-    def delayed(self, value: bytes) -> bytes:
-        """Add ``value`` and return the newest value that is old enough, or else the oldest."""
-        now_ns = self._clock.now_ns()
-        self._values.append((now_ns, value))
-        while len(self._values) > 1 and seconds_between(self._values[1][0], now_ns) >= self._seconds:
-            del self._values[0]
-        return self._values[0][1]

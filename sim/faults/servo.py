@@ -1,12 +1,14 @@
 """Simulated faults of the servo, its gears and its bus."""
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from rig.core.clock import seconds_between
 from sim.devices import SimDevices
-from sim.faults.kind import Delay, End, Parameter, repeatedly, share, simulated_fault
+from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
 from sim.servo import SentBytes, XSeriesServo
 from sim.servo.control_table import Memory
 from sim.servo.device import OVERLOAD_ERROR
@@ -81,8 +83,16 @@ def _slow(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End
     "servo.delayed", "The servo reports old readings.", seconds=Parameter(0.3, "age of the readings, s", 0, 10)
 )
 def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    delay = Delay(devices.world.clock, values["seconds"])
-    return _distort(devices, lambda memory: memory.set_live(delay.delayed(memory.live())))
+    clock, readings = devices.world.clock, deque[tuple[int, bytes]]()
+
+    def age(memory: Memory) -> None:
+        """Show the newest reading that is old enough, or else the oldest."""
+        readings.append((clock.now_ns(), memory.live()))
+        while len(readings) > 1 and seconds_between(readings[1][0], clock.now_ns()) >= values["seconds"]:
+            readings.popleft()
+        memory.set_live(readings[0][1])
+
+    return _distort(devices, age)
 
 
 @simulated_fault("servo.intermittent", "A contact is loose. Some answers are lost.", rate=share(0.05, "answers"))

@@ -1,6 +1,6 @@
 """Commands of the trainee to the simulated world, such as ``put mug-white``, ``jam`` or ``rotate 90``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -36,17 +36,15 @@ _OF_ONE_PROGRAM: Final = ("disk_full", "clock_jump")
 class Commands:
     """The commands of the trainee, which change a simulated world.
 
-    ``quit`` is called to end the bench.
+    ``ended`` is whether the trainee has ended the bench.
     """
 
-    def __init__(
-        self, operator: ShelfOperator, devices: SimDevices, faults: Faults, quit: Callable[[], None] = lambda: None
-    ) -> None:
+    def __init__(self, operator: ShelfOperator, devices: SimDevices, faults: Faults) -> None:
+        self.ended = False
         self._operator = operator
         self._devices = devices
         self._world = devices.world
         self._faults = faults
-        self._quit = quit
 
     def do(self, words: Sequence[str]) -> str:
         """Carry out a command, and return the result in words.
@@ -85,7 +83,7 @@ class Commands:
                 _arguments(command, given)
                 return self._describe()
             case "quit":
-                self._quit()
+                self.ended = True
                 return "The simulated bench ends."
             case "help":
                 return HELP

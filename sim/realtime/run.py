@@ -61,7 +61,7 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
             ports.append(_port(devices.head_port, folder / HEAD, ends))
         time = RealTime(world.clock, ports)
         operator = ShelfOperator(world, shelf())
-        commands = Commands(operator, devices, faults, quit=lambda: setattr(time, "over", True))
+        commands = Commands(operator, devices, faults)
         server = ends.enter_context(BenchServer(folder, devices, time, commands))
 
         text = (

@@ -7,7 +7,6 @@ A request is one line of JSON. The answer is also one line of JSON, followed by 
 import json
 import socket
 import socketserver
-import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any, Final
 
 import cv2
 
-from rig.core.clock import SystemClock, seconds_between
+from rig.core.clock import SystemClock
 from rig.core.files import json_values
 from sim.camera import SELECT_S
 from sim.devices import SimDevices
@@ -25,11 +24,8 @@ from sim.realtime.pace import RealTime
 from sim.realtime.wire import SOCKET, short_path
 
 MAX_LINE: Final = 100_000  # longer than all commands: a program that sends something else must not fill the memory
-MAX_CONNECTIONS: Final = 64  # each has a thread; a program that never closes its connections is noticed
 _POLL_S: Final = 0.05
 """Period with which the wait for a frame checks whether the camera was unplugged."""
-_LAST_ANSWERS_S: Final = 2.0
-"""How long the end of the bench waits for programs that do not read their answer."""
 
 Answer = tuple[dict[str, Any], bytes]
 
@@ -163,17 +159,21 @@ def _message(address: Any, content: Any) -> tuple[int, bytes | int]:
 class _Handler(socketserver.StreamRequestHandler):
     """Answers one connection in its own thread."""
 
+    server: "BenchServer"
+
     def handle(self) -> None:
-        assert isinstance(self.server, BenchServer)
-        session = ClientSession(self.server)
+        session, bench = ClientSession(self.server), self.server
+        bench.connections.add(self.connection)
         try:
             while line := self.rfile.readline(MAX_LINE):
                 answer, payload = session.answer(json_values(line))
                 self.wfile.write(json.dumps({**answer, "bytes": len(payload)}).encode() + b"\n" + payload)
+                bench.time.over |= bench.commands.ended  # only now, so that the command to end it is answered
         except (ValueError, OverflowError, OSError):  # no request, or the program has ended
             pass
         finally:
             session.close()
+            bench.connections.discard(self.connection)
 
     def finish(self) -> None:
         with suppress(OSError):
@@ -181,50 +181,22 @@ class _Handler(socketserver.StreamRequestHandler):
 
 
 class BenchServer(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
-    """Listens at a socket in ``folder``."""
+    """Listens at a socket in ``folder``. Its end ends the connections."""
 
-    request_queue_size = MAX_CONNECTIONS
+    daemon_threads = True
 
     def __init__(self, folder: Path, devices: SimDevices, time: RealTime, commands: Commands) -> None:
         self.devices, self.time, self.commands = devices, time, commands
         self.camera_user: ClientSession | None = None
+        self.connections: set[socket.socket] = set()
         self._path = folder / SOCKET
-        self._connections: dict[socket.socket, threading.Thread] = {}
         self._path.unlink(missing_ok=True)
         with short_path(folder) as path:
             super().__init__(f"{path}/{SOCKET}", _Handler)
 
-    def verify_request(self, request: object, client_address: object) -> bool:  # noqa: ARG002
-        """Return whether there is room for one more connection."""
-        return len(self._connections) < MAX_CONNECTIONS
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection in a thread."""
-        thread = threading.Thread(target=self.process_request_thread, args=(request, client_address), daemon=True)
-        self._connections[request] = thread
-        thread.start()
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """End the connection after its last answer."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            del self._connections[request]
-
     def server_close(self) -> None:
-        """Answer the pending requests, then end the connections."""
         super().server_close()
-        connections = dict(self._connections)
-        for connection in connections:
-            _shut(connection, socket.SHUT_RD)  # no more requests; an answer that was begun is completed
-        clock = SystemClock()
-        begun_ns = clock.now_ns()
-        for connection, thread in connections.items():
-            thread.join(max(0.0, _LAST_ANSWERS_S - seconds_between(begun_ns, clock.now_ns())))
-            _shut(connection, socket.SHUT_RDWR)
+        for connection in tuple(self.connections):
+            with suppress(OSError):  # it has ended
+                connection.shutdown(socket.SHUT_RDWR)
         self._path.unlink(missing_ok=True)
-
-
-def _shut(connection: socket.socket, how: int) -> None:
-    with suppress(OSError):  # it has ended
-        connection.shutdown(how)

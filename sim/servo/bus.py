@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Protocol
 
 from sim.clock import VirtualClock
-from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, StatusPacket, status_packet
+from sim.servo.device import XSeriesServo
+from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, status_packet
 
 BITS_PER_BYTE = 10  # a start bit, 8 data bits, a stop bit
 ABANDON_S = 0.05  # silence after which a device drops an incomplete packet; the e-manual states no value
@@ -45,20 +45,6 @@ class SentBytes:
         return self.arrival_ns(len(self.data))
 
 
-class BusDevice(Protocol):
-    """The interface of a servo on the bus."""
-
-    @property
-    def bus_id(self) -> int: ...
-    @property
-    def baudrate(self) -> int: ...
-    @property
-    def powered(self) -> bool: ...
-    @property
-    def return_delay_ns(self) -> int: ...
-    def execute(self, packet: InstructionPacket) -> StatusPacket | None: ...
-
-
 class ServoBus:
     """Servos on one bus, and the host's adapter.
 
@@ -85,17 +71,17 @@ class ServoBus:
         self.filters: list[Callable[[SentBytes], SentBytes | None]] = []
         self.echo = False
         self.deaf = False
-        self._devices: list[BusDevice] = []
+        self._devices: list[XSeriesServo] = []
         self._deliver: Callable[[SentBytes], None] | None = None
         self._sent_until_ns = 0
         self._parser = PacketParser()
         self._last_frame = SentBytes(Sender.HOST, 0, 1, b"")
 
-    def attach(self, device: BusDevice) -> None:
+    def attach(self, device: XSeriesServo) -> None:
         """Connect a servo to the bus."""
         self._devices.append(device)
 
-    def detach(self, device: BusDevice) -> None:
+    def detach(self, device: XSeriesServo) -> None:
         """Disconnect a servo from the bus; ValueError if it is not connected."""
         self._devices.remove(device)
 

@@ -72,11 +72,6 @@ class Memory:
         """Set the registers that follow the world, in the order of `live`."""
         self._image[self.live_start : self._live_end] = block
 
-    @property
-    def starts_with_torque(self) -> bool:
-        """Whether the Startup Configuration enables torque at power-up; not all models have it."""
-        return "Startup Configuration" in self._registers and self["Startup Configuration"] == 1
-
     def forget_ram(self) -> None:
         """Set the RAM area to its initial values, as at power-up."""
         self._restore(self.ram_start, self._size)

@@ -23,7 +23,7 @@ WATCHDOG_TRIPPED = 0xFF
 VOLTAGE_ERROR, OVERHEATING_ERROR, ENCODER_ERROR, ELECTRICAL_ERROR, OVERLOAD_ERROR = 0x01, 0x04, 0x08, 0x10, 0x20
 """Bits of Hardware Error Status and Shutdown."""
 
-_TIME_BASED, _TORQUE_BY_GOAL = 0x04, 0x08  # bits of Drive Mode
+_TIME_BASED = 0x04  # bit of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 
 
@@ -258,9 +258,6 @@ class XSeriesServo:
         self._powered = True
         self.memory.forget_ram()
         self._controller.start()
-        if self.memory.starts_with_torque:
-            self.memory["Torque Enable"] = 1
-            self._on_torque_enable()
         self._check_shutdown()
 
     def _schedule(self, action: Callable[[], None], time_ns: int | None) -> None:
@@ -305,16 +302,9 @@ class XSeriesServo:
         self._supervise()
 
     def _on_goal(self, pursue: Callable[[], None]) -> None:
-        memory = self.memory
-        if not memory["Torque Enable"]:
-            if self._shut_down() or not memory["Drive Mode"] & _TORQUE_BY_GOAL:
-                return
-            goals = memory["Goal Position"], memory["Goal Velocity"]
-            memory["Torque Enable"] = 1
-            self._torque_on()
-            memory["Goal Position"], memory["Goal Velocity"] = goals
-        pursue()
-        self._supervise()
+        if self.memory["Torque Enable"]:  # in the drive mode "torque on by goal update", too: the rig switches it off
+            pursue()
+            self._supervise()
 
     def _check_shutdown(self) -> None:
         if not self._powered:

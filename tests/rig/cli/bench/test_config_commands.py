@@ -54,7 +54,7 @@ def test_check_accepts_or_rejects_each_servo_of_the_sdk_by_its_name(rig):
             assert "servo.model: the rig cannot drive this model: its row in the table of models lacks" in done.stderr
             assert f"{USE_ANOTHER} (found '{model}')" in " ".join(done.stderr.split())
             rejected.add(model)
-    assert len(model_numbers()) == 62
+    assert len(model_numbers()) == 61
     assert {name for name in rejected if not name.startswith("ym0")} == {"xl320", "rh_p12_rn"}
     assert len(rejected) == 14
 

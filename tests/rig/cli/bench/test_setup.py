@@ -122,7 +122,7 @@ def test_servo_that_the_rig_cannot_drive_is_neither_configured_nor_changed(parts
     memory["Model Number"] = 4000
     done = rig("setup")
     assert done.exit_code == 4
-    assert "YM070-210-M001, firmware 46, id 1 at 57600 baud (protocol 2.0): the rig cannot drive it" in done.stdout
+    assert "YM070-210-M001, firmware 46, id 1 at 57600 baud: the rig cannot drive it" in done.stdout
     assert not load_config(home / "rig.toml").servo.model_fields_set
     assert rig("servo", "settings", "--write", "--yes").exit_code == 4
     assert (memory["Operating Mode"], memory["Return Delay Time"]) == (3, 250)
