@@ -29,7 +29,7 @@ from hbr import (
 from hbr.core.arrays import ImageArray, IndexArray
 from hbr.dense.filter import Belief
 from hbr.descriptors import names
-from hbr.evaluation.perturb import plain_bench
+from hbr.drawing.bench import ENROLLMENT, DrawnBench, Visit
 from hbr.paper.hmm import PoseBelief, PoseModel, update_poses
 
 #: The views of a search, as positions on an object's ring of 72.
@@ -140,7 +140,7 @@ def main() -> None:
     print(f"{'views':>7} {'call':<58} {'min ms':>8} {'median ms':>10} {'ratio':>6}")
     for objects in (100, 1_000):
         bench_step(objects)
-    table = np.clip(plain_bench(np.random.default_rng(0)), 0, 255).astype(np.uint8)
+    table = Visit(DrawnBench.drawn(np.random.default_rng(0), plain=True), ENROLLMENT, np.random.default_rng(0)).empty()
     rng = np.random.default_rng(1)
     scene = table.copy()
     scene[60:190, 120:200] = cv2.resize(rng.integers(0, 256, (6, 4, 3), np.uint8), (80, 130))

@@ -119,7 +119,7 @@ def enroll_changed(item: PhotographedObject, experiment: Experiment) -> Enrolled
     """
     scene = _enrollment_scene(experiment)
     places = _enrolled_places(item, experiment)
-    kind, picture = experiment.condition.descriptor, _has_picture(experiment)
+    kind, picture = experiment.condition.descriptor, experiment.picture
     views, empty = ViewsTogether(kind, several=False), Background(scene.empty()) if picture else None
     for place in places:
         views.learn(scene.frame(item, place), empty)
@@ -187,7 +187,7 @@ def searches(item: PhotographedObject, experiment: Experiment) -> Iterator[Searc
     DatasetError
         A photograph cannot be used.
     """
-    before = Background(_enrollment_scene(experiment).empty()) if _has_picture(experiment) else None
+    before = Background(_enrollment_scene(experiment).empty()) if experiment.picture else None
     for trial in range(experiment.protocol.trials):
         rng = generator(experiment.protocol.seed, item.name, "trial", trial)
         scene = _search_scene(experiment, rng)
@@ -363,8 +363,8 @@ class _OwnScene:
     def frame(self, item: PhotographedObject, place: int) -> ImageArray:
         image = item.photographs[place].read()
         if self.seed is None:
-            return self.condition.enrolled(image, generator(0, item.name, "enrolled", place)).image
-        return self.condition.query(image, generator(self.seed, item.name, "photograph", place)).image
+            return self.condition.enrolled(image, generator(0, item.name, "enrolled", place))
+        return self.condition.query(image, generator(self.seed, item.name, "photograph", place))
 
 
 def _enrollment_scene(experiment: Experiment) -> _Scene:
@@ -397,11 +397,6 @@ def _query_places(item: PhotographedObject, experiment: Experiment, azimuth_deg:
         )
     left = replace(item, photographs=tuple(item.photographs[place] for place in others))
     return [int(others[place]) for place in nearest_photographs(left, azimuth_deg)]
-
-
-def _has_picture(experiment: Experiment) -> bool:
-    """Return whether enrollment and searches use a picture of their empty table."""
-    return experiment.condition.reference != "none"
 
 
 def cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[np.bool_]]:
@@ -454,7 +449,7 @@ def _search(
 
 def _results(experiment: Experiment, dataset: Dataset, views: Views, found: list[list[SearchResult]]) -> dict[str, Any]:
     searched = {item.name: results for item, results in zip(dataset.objects, found, strict=True)}
-    words = f"{experiment.change}{', plain' * experiment.plain}, {'' if _has_picture(experiment) else 'no '}picture"
+    words = f"{experiment.change}{', plain' * experiment.plain}, {'' if experiment.picture else 'no '}picture"
 
     def row(objects: str, of: Collection[str]) -> dict[str, Any]:
         some = {name: results for name, results in searched.items() if name in of}

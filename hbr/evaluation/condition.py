@@ -2,8 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cache
-from typing import Any, Final, Literal, NamedTuple, TypeVar, get_args
+from typing import Any, Final, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -12,26 +11,16 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors import descriptor
 from hbr.descriptors.registry import describe
-from hbr.drawing.bench import Picture
 from hbr.drawing.noise import Noise
-from hbr.evaluation.perturb import Perturbations, other_bench, plain_bench
+from hbr.evaluation.perturb import Perturbations
 from hbr.evaluation.photographs import Dataset, object_mask
 from hbr.evaluation.protocol import generator
 from hbr.segmentation import segment
 
-EnrolledBackground = Literal["same", "uniform", "textured"]
-Background = Literal[EnrolledBackground, "bench", "other-bench"]
-Reference = Literal["own", "enrollment", "none"]
+Background = Literal["same", "uniform", "textured"]
 _T = TypeVar("_T", np.uint8, np.float32)
 
 _TEXTURE_OCTAVES: Final = (4, 8, 16, 32)  # coarse to fine; each octave is weaker, as in photographs of surfaces
-
-
-class EvaluationImage(NamedTuple):
-    """An image and its empty-table image, if there is one."""
-
-    image: ImageArray
-    empty: ImageArray | None = None
 
 
 @dataclass(frozen=True)
@@ -46,19 +35,14 @@ class Condition:
         Noise of the queries, applied at that size.
     rotation_deg : float
         Largest rotation of a query in the image plane, to either side; the angle is random.
-    background : {"same", "uniform", "textured", "bench", "other-bench"}
-        Background of a query instead of the dark surroundings. ``bench`` puts enrolled objects and queries on the same
-        plain bench, ``other-bench`` the queries on one of several benches with patterns and clutter. Both provide an
-        empty-table image.
+    background : {"same", "uniform", "textured"}
+        Background of a query instead of the dark surroundings.
     prefilter_px : float
         Standard deviation of a Gaussian blur of all images, also of enrolled views; 0: no blur.
     perturbations : Perturbations
         Perturbations of the queries.
     descriptor : str
         Descriptor of enrolled views and queries.
-    reference : {"own", "enrollment", "none"}
-        Empty-table image of queries on a bench: of their own bench and illumination, of the enrollment's bench, or no
-        such image for queries and enrolled views.
     enrolled_noise : Noise
         Noise of the enrolled views.
     enrolled_background : {"same", "uniform", "textured"}
@@ -74,9 +58,8 @@ class Condition:
     prefilter_px: float = 0.0
     perturbations: Perturbations = field(default_factory=Perturbations)
     descriptor: str = "cedd"
-    reference: Reference = "own"
     enrolled_noise: Noise = field(default_factory=Noise)
-    enrolled_background: EnrolledBackground = "same"
+    enrolled_background: Background = "same"
     cut_out: bool = False
 
     def __post_init__(self) -> None:
@@ -86,62 +69,39 @@ class Condition:
             raise ValueError(f"a rotation of {self.rotation_deg} degrees; 0 to 180 are possible")
         if not (np.isfinite(self.prefilter_px) and self.prefilter_px >= 0):
             raise ValueError(f"a prefilter of {self.prefilter_px} pixels; at least 0 is needed")
-        if self.background not in get_args(Background):
-            raise ValueError(f"background {self.background!r} is unknown; use one of {', '.join(get_args(Background))}")
-        if self.reference not in get_args(Reference):
-            raise ValueError(f"reference {self.reference!r} is unknown; use one of {', '.join(get_args(Reference))}")
-        if self.enrolled_background not in get_args(EnrolledBackground):
-            raise ValueError(
-                f"enrolled_background {self.enrolled_background!r} is unknown; "
-                f"use one of {', '.join(get_args(EnrolledBackground))}"
-            )
-        if self.on_bench and self.enrolled_background != "same":
-            raise ValueError("on a bench, enrolled views have its background; leave enrolled_background out")
+        for name in ("background", "enrolled_background"):
+            if (value := getattr(self, name)) not in get_args(Background):
+                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(get_args(Background))}")
         if self.cut_out and not descriptor(self.descriptor).whole_image:
             raise ValueError(f"{self.descriptor} cuts the object out itself; leave cut_out out")
-        if (self.on_bench or self.perturbations) and (self.rotation_deg or self.background in ("uniform", "textured")):
+        if self.perturbations and (self.rotation_deg or self.background != "same"):
             raise ValueError(
-                "a rotation in the plane, and a uniform or textured background, cannot be combined with perturbations "
-                "or a bench; leave out one of them"
+                "a rotation in the plane, and a uniform or textured background, cannot be combined with perturbations; "
+                "leave out one of them"
             )
         descriptor(self.descriptor)
 
-    @property
-    def on_bench(self) -> bool:
-        """Whether objects stand on a drawn bench."""
-        return self.background in ("bench", "other-bench")
-
-    def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> EvaluationImage:
+    def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> ImageArray:
         """Return the image of an enrolled view; `rng` draws its noise."""
         image = self._sized(image_bgr)
-        empty: ImageArray | None = None
-        if self.on_bench:
-            image, empty = Perturbations().photograph(
-                image, object_mask(image), np.random.default_rng(0), _benches()[0]
-            )
         if self.enrolled_background != "same":
             image = _before(image, object_mask(image), self.enrolled_background, rng or np.random.default_rng(0))
-        noisy = self.enrolled_noise.apply(image, rng or np.random.default_rng(0))
-        return EvaluationImage(self._prefiltered(noisy), None if self.reference == "none" else empty)
+        return self._prefiltered(self.enrolled_noise.apply(image, rng or np.random.default_rng(0)))
 
-    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> EvaluationImage:
+    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> ImageArray:
         """Return the image of a query; equal states of `rng` give equal images."""
         image = self._sized(image_bgr)
-        if self.on_bench or self.perturbations:
-            first, *others = _benches()
-            bench = {"bench": first, "other-bench": others[int(rng.integers(len(others)))]}.get(self.background)
-            image, empty = self.perturbations.photograph(image, object_mask(image), rng, bench)
-            if self.reference != "own":
-                empty = _shown(first) if self.on_bench and self.reference == "enrollment" else None
-            return EvaluationImage(self._prefiltered(self.noise.apply(image, rng)), empty)
-        if self.rotation_deg or self.background != "same":
+        if self.perturbations:
+            rng.integers(8)  # has no use any more, but without it the figures in docs/results.md would change
+            image = self.perturbations.photograph(image, object_mask(image), rng)
+        elif self.rotation_deg or self.background != "same":
             mask = object_mask(image).astype(np.float32)
             if self.rotation_deg:
                 angle_deg = rng.uniform(-self.rotation_deg, self.rotation_deg)
                 image, mask = _rotated(image, angle_deg), _rotated(mask, angle_deg)
             if self.background != "same":
                 image = _before(image, mask, self.background, rng)
-        return EvaluationImage(self._prefiltered(self.noise.apply(image, rng)))
+        return self._prefiltered(self.noise.apply(image, rng))
 
     def _sized(self, image_bgr: ImageArray) -> ImageArray:
         height, width = image_bgr.shape[:2]
@@ -158,17 +118,6 @@ class Condition:
             return image_bgr
         blurred = cv2.GaussianBlur(image_bgr, (0, 0), self.prefilter_px, borderType=cv2.BORDER_REPLICATE)
         return blurred.astype(np.uint8, copy=False)
-
-
-@cache
-def _benches() -> tuple[Picture, ...]:
-    """Return the plain bench, and eight others."""
-    rng = np.random.default_rng(801)
-    return (plain_bench(rng), *(other_bench(rng) for _ in range(8)))
-
-
-def _shown(bench: Picture) -> ImageArray:
-    return np.clip(np.rint(bench), 0, 255).astype(np.uint8)
 
 
 def _rotated(image: NDArray[_T], angle_deg: float) -> NDArray[_T]:
@@ -219,8 +168,6 @@ def query_levels(dataset: Dataset, j: int, condition: Condition, seed: int) -> L
     return _levels((condition.query(image, generator(seed, name, "photograph", i)) for i, image in images), condition)
 
 
-def _levels(images: Iterable[EvaluationImage], condition: Condition) -> LevelArray:
-    if condition.cut_out:
-        cut = (segment(image, empty_table=empty).alone for image, empty in images)
-        return np.stack([describe(one, descriptor=condition.descriptor) for one in cut])
-    return np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in images])
+def _levels(images: Iterable[ImageArray], condition: Condition) -> LevelArray:
+    shown = (segment(image).alone for image in images) if condition.cut_out else images
+    return np.stack([describe(image, descriptor=condition.descriptor) for image in shown])

@@ -36,6 +36,8 @@ class Experiment:
         None: trials that compare methods. Else searches of the rig, also for objects that are left out, after this
         change of a whole drawn bench; none: the photographs as they are, with the noise of the condition, and queries
         that are not enrolled.
+    picture : bool
+        Whether enrollment and searches use a picture of their empty table, if the bench changes.
     plain : bool
         Whether all drawn benches have a plain backdrop and a visible platter.
     margin, min_views
@@ -50,6 +52,7 @@ class Experiment:
     report: tuple[int, int] | None = None
     every: int = 1
     change: Change | None = None
+    picture: bool = True
     plain: bool = False
     margin: float = 0.02
     min_views: int = 2
@@ -57,8 +60,8 @@ class Experiment:
     def __post_init__(self) -> None:
         if self.change is not None and self.change not in get_args(Change):
             raise ValueError(f"change {self.change!r} is unknown; use none, mild or hard")
-        if self.change == "none" and self.condition.reference != "none":
-            raise ValueError("photographs as they are have no empty-table image; give reference = none")
+        if self.change == "none" and self.picture:
+            raise ValueError("photographs as they are have no empty-table image; give picture = false")
         if self.every < 1:
             raise ValueError(f"every is {self.every}; at least 1 is needed")
         if self.change is not None and self.protocol.enrolled is None:
@@ -87,6 +90,7 @@ class Experiment:
             "methods": [asdict(method) for method in self.methods],
             "every": self.every,
             "change": self.change,
+            "picture": self.picture,
             "plain": self.plain,
         }
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
-from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.dense.filter import BETA, Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
@@ -22,7 +22,7 @@ from hbr.dense.pose import azimuth_of, pose
 from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome
 from hbr.descriptors import descriptor
-from hbr.evaluation.condition import Condition, EvaluationImage, enrolled_levels, query_levels
+from hbr.evaluation.condition import Condition, enrolled_levels, query_levels
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.poses import stated_pose
@@ -106,8 +106,8 @@ class LocalPhotographs:
         return self._known[object_index, number]
 
 
-def _local_view(shown: EvaluationImage, azimuth_deg: float) -> LocalView:
-    cut = segment(shown.image, empty_table=shown.empty)
+def _local_view(image: ImageArray, azimuth_deg: float) -> LocalView:
+    cut = segment(image)
     return LocalView(cut.crop, cut.mask, azimuth_deg)
 
 

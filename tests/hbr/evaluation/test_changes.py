@@ -7,7 +7,6 @@ import pytest
 
 import hbr
 from hbr.evaluation.changes import SearchResult, intervals, is_enrolled, summary
-from hbr.evaluation.condition import Condition
 from hbr.evaluation.experiment import Experiment
 from hbr.evaluation.protocol import Protocol
 
@@ -61,9 +60,7 @@ def test_stated_probabilities_are_compared_with_the_shares_of_right_answers() ->
 
 
 def test_every_ninth_object_is_never_enrolled() -> None:
-    changed = Experiment(
-        "changed", protocol=Protocol(enrolled=18), condition=Condition(reference="none"), change="mild"
-    )
+    changed = Experiment("changed", protocol=Protocol(enrolled=18), change="mild", picture=False)
     assert [place for place in range(20) if not is_enrolled(place, changed)] == [8, 17]
     assert all(is_enrolled(place, replace(changed, change="none")) for place in range(20))
 

@@ -11,8 +11,8 @@ import pytest
 
 import hbr
 from hbr import Background, segment
-from hbr.evaluation.perturb import other_bench, plain_bench
 from hbr.segmentation import CROP_PX, BoxMethod, Issue, IssueCode
+from tests.hbr.segmentation.benches import other_bench, plain_bench
 
 BOX = (130, 70, 60, 110)
 
