@@ -262,7 +262,7 @@ class Stage(NamedTuple):
     findings: tuple[str, ...] = ()
 
 
-class SimBenchKind:
+class SimBenchKind(BenchKind):
     """The kind of bench ``sim``: a simulated bench in a new world whose clock starts at the computer's time."""
 
     name = "sim"

@@ -3,16 +3,18 @@
 Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, and those of other packages.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from pydantic import BaseModel
 
+from rig.bench.computer import Computer
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
 from rig.calibrations.store import CALIBRATIONS
 from rig.config import RigConfig
@@ -189,30 +191,29 @@ class Bench(AbstractContextManager["Bench"]):
         return {key: value for key, value in whole.items() if not parts or key in ("bench", "conditions", *parts)}
 
 
-class BenchKind(Protocol):
-    """A plug-in: the options of a kind of bench, and how to open it."""
+class BenchKind(ABC):
+    """A plug-in: a kind of bench, and how to open it. ``options`` is the model of the section ``[bench.<name>]``."""
 
-    @property
-    def options(self) -> type[BaseModel]:
-        """Model of the section ``[bench.<name>]``."""
+    options: type[BaseModel]
 
+    @abstractmethod
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
         """Open the devices; if one fails, close those already opened."""
 
+    @contextmanager
+    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:
+        """Open the servo to stop it, without the other devices if the kind can do that: one of them may fail."""
+        with self.open(config, options, seed) as bench:
+            yield bench.servo
 
-@runtime_checkable
-class ServoAlone(Protocol):
-    """A kind of bench whose servo can be opened without the other devices, to stop it when another device fails."""
+    @contextmanager
+    def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:  # noqa: ARG002
+        """Yield the computer to which the devices are connected, while the bench is not open."""
+        yield Computer()
 
-    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Servo]: ...
-
-
-@runtime_checkable
-class FitsConfig(Protocol):
-    """A kind of bench on which other settings follow from its options, such as the size of the camera's frames."""
-
-    def fitted(self, config: RigConfig, options: Any) -> RigConfig:
-        """Return the configuration with these settings."""
+    def fitted(self, config: RigConfig, options: Any) -> RigConfig:  # noqa: ARG002
+        """Return the configuration with settings that follow from the options, such as the size of the frames."""
+        return config
 
 
 def bench_names() -> list[str]:
@@ -269,12 +270,8 @@ def open_servo(name: str | None = None, config: RigConfig | None = None, *, seed
     """
     config = config or RigConfig()
     kind, options = _kind(name or config.default_bench, config)
-    if isinstance(kind, ServoAlone):
-        with kind.open_servo(config, options, seed) as servo:
-            yield servo
-    else:
-        with kind.open(config, options, seed) as bench:
-            yield bench.servo
+    with kind.open_servo(config, options, seed) as servo:
+        yield servo
 
 
 def calibrate(bench: Bench, store: CalibrationStore) -> None:

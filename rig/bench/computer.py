@@ -12,12 +12,11 @@ import pwd
 import re
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
-from rig.config import RigConfig
 from rig.core.camera_node import camera_node
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import BenchBusy
@@ -416,13 +415,6 @@ class Computer:
             if folder == self.root.resolve():
                 break
         return {}
-
-
-@runtime_checkable
-class ComputerProvider(Protocol):
-    """A kind of bench whose computer can be examined while the bench is not open."""
-
-    def computer(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Computer]: ...
 
 
 def _natural(name: str) -> list[Any]:

@@ -36,16 +36,11 @@ class NoOptions(Section):
     """The real bench has no options: [servo], [table], [imu] and [camera] describe it."""
 
 
-class HardwareBench:
+class HardwareBench(BenchKind):
     """Opens the devices in the configuration. State, calibrations and catalog belong to its name."""
 
     name = "hardware"
     options: type[BaseModel] = NoOptions
-
-    @contextmanager
-    def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:  # noqa: ARG002
-        """Yield the computer to which the devices are connected."""
-        yield Computer()
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
         """Open the devices on the system's clock; ``seed`` is not used."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from rig.bench import FitsConfig, bench_kind
-from rig.bench.computer import Computer, ComputerProvider
+from rig.bench import bench_kind
+from rig.bench.computer import Computer
 from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.next_steps import Do, NextStep
@@ -70,14 +70,10 @@ def open_context(
     """
     kind = bench_kind(bench)
     chosen = validate(kind.options, config.bench.get(bench, {}), where="the configuration", prefix=f"bench.{bench}")
-    if isinstance(kind, FitsConfig):
-        config = kind.fitted(config, chosen)
+    config = kind.fitted(config, chosen)
     try:
         who = None if is_held else holder(config.state_path(bench))
     except OSError:  # the folder is not readable: the check of the bench's state reports it
         who = None
-    if isinstance(kind, ComputerProvider):
-        with kind.computer(config, chosen, seed) as computer:
-            yield DoctorContext(computer, config, bench, options, file_options, who)
-    else:
-        yield DoctorContext(Computer(), config, bench, options, file_options, who)
+    with kind.computer(config, chosen, seed) as computer:
+        yield DoctorContext(computer, config, bench, options, file_options, who)

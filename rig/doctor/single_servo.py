@@ -128,7 +128,7 @@ def single_servo(context: DoctorContext, progress: Callable[[str], None] = lambd
         wire.close()
 
 
-def _told(scan: Generator[str, None, list[BaudScan]], progress: Callable[[str], None]) -> list[BaudScan]:
+def _scanned(scan: Generator[str, None, list[BaudScan]], progress: Callable[[str], None]) -> list[BaudScan]:
     """Return what a scan returns, and report its texts."""
     while True:
         try:
@@ -139,7 +139,7 @@ def _told(scan: Generator[str, None, list[BaudScan]], progress: Callable[[str], 
 
 def _find_only_servo(context: DoctorContext, wire: SerialConnection, progress: Callable[[str], None]) -> FoundServo:
     """Scan all baud rates: a second servo at another rate would answer as soon as the rates are equal."""
-    scans = _told(scan_rates(wire, context.computer.clock, BAUD_RATES, context.config.servo.port), progress)
+    scans = _scanned(scan_rates(wire, context.computer.clock, BAUD_RATES, context.config.servo.port), progress)
     if scans and (ids := scans[-1].duplicate_ids):
         raise SeveralServos(
             f"Two servos answer at once to id {', '.join(map(str, ids))} at {scans[-1].baud} baud.",
