@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import pytest
 from typer.testing import CliRunner
 
-from rig.bench.hardware import NoOptions
+from rig.bench.hardware import HardwareBench
 from rig.cli.main import app
 from rig.config import load_config
 from tests.rig.doctor.doctor_parts import unopened
@@ -31,9 +31,7 @@ def parts(home, monkeypatch):
     """Return a bench whose parts have factory settings; the command line uses it."""
     with unopened() as bench:
 
-        class Kind:
-            options = NoOptions
-
+        class Kind(HardwareBench):
             @contextmanager
             def computer(self, config, options, seed):
                 bench.context.computer._port = config.servo.port
