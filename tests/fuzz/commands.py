@@ -118,7 +118,10 @@ def check(done: Done, arguments: tuple[str, ...]) -> None:
         assert not [c for c in text if unicodedata.category(c) == "Cc" and c not in "\n\t"], (arguments, text)
     if done.exit_code:
         shown = done.out + done.err  # rig status reports a broken device among the others
-        assert "Next step:" in shown or "─ Error ─" in done.err or done.exit_code in (6, 7, 8), (arguments, done)
+        assert "Next step:" in shown or "for help.\n\nError: " in done.err or done.exit_code in (6, 7, 8), (
+            arguments,
+            done,
+        )
     if asks_for_json(arguments):
         assert all(isinstance(json.loads(line), dict) for line in done.out.splitlines()), (arguments, done.out)
 

@@ -30,7 +30,7 @@ def keep_torque_on(wires) -> None:
     """Have the servo acknowledge the instruction to switch its torque off, but not carry it out."""
     device = wires.device
     write, torque_off = device._write, (64, b"\0")
-    device._write = lambda address, data, group: None if (address, data) == torque_off else write(address, data, group)
+    device._write = lambda address, data: None if (address, data) == torque_off else write(address, data)
 
 
 def interrupt_at(bench, wires, angle_deg: float) -> None:
