@@ -130,7 +130,8 @@ def jog(desk: Desk, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -> 
     with desk.open_bench(DEVICES) as bench:
         try:
             with Turntable(bench) as table:
-                for number, key in enumerate(keys):
+                number, target_deg = 0, table.rest_deg
+                for key in keys:
                     match key:
                         case None:
                             bench.safety.check_stop_request()
@@ -147,11 +148,13 @@ def jog(desk: Desk, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -> 
                         case JogKey.HOME:
                             target_deg = 0.0
                         case _:
-                            target_deg = table.rest_deg + (step_deg if key is JogKey.FORWARD else -step_deg)
+                            # From the last target: friction holds the table short of it, and steps must not add that up.
+                            target_deg += step_deg if key is JogKey.FORWARD else -step_deg
                     low_deg, high_deg = table.limits_deg
                     target_deg = min(max(target_deg, low_deg), high_deg)
                     event = moved(number, (yield from announced(number, table, target_deg, asked_deg=target_deg)))
                     yield event
+                    number += 1
                     angle_deg = event.encoder_deg
         except RigError as error:
             yield from desk.log(Action.MOVED, to_deg=angle_deg, ended=error.what)

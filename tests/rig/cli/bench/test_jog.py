@@ -42,7 +42,7 @@ def test_keys_rotate_by_steps_within_the_limits(jog, simulated):
     steps = [event.text for event in events if isinstance(event, Remark)]
     assert steps == ["step 1°", "step 5°", "step 15°", "step 45°", "step 90°"]
     angles = [event.commanded_deg for event in events if isinstance(event, Moved)]
-    assert angles == pytest.approx([5.0, 4.0, 94.0, 184.0, 200.0, 0.0], abs=0.5)
+    assert angles == pytest.approx([5.0, 4.0, 94.0, 184.0, 200.0, 0.0], abs=0.1)
     assert torque(s) == 0
 
 
