@@ -1,11 +1,12 @@
 """Measure how the platter rings after a stop, by its own gyro: frequency and damping.
 
-After the end of the servo's profile, the rate of the platter is a decaying oscillation about the gyro's bias:
+After the end of the servo's profile, the rate of the platter is a decaying oscillation, and the rest of the motion of a
+shaft that lags behind its profile by the time τ, about the gyro's bias:
 
-    r(t) = exp(−ζωt)·(A·cos(ω_d·t) + B·sin(ω_d·t)) + c,    ω_d = ω·√(1 − ζ²)
+    r(t) = exp(−ζωt)·(A·cos(ω_d·t) + B·sin(ω_d·t)) + C·exp(−t/τ) + c,    ω_d = ω·√(1 − ζ²)
 
-All stops have the same ω and ζ, and each its own A, B and c, which follow by linear least squares. The uncertainties
-come from fits without one of the stops (jackknife). `rig.motion.shaper` uses the result.
+All stops have the same ω, ζ and τ, and each its own A, B, C and c, which follow by linear least squares. The
+uncertainties come from fits without one of the stops (jackknife). `rig.motion.shaper` uses the result.
 """
 
 from collections.abc import Sequence
@@ -32,9 +33,10 @@ Floats = NDArray[np.float64]
 SWING_DEG = 20.0  # a start and a stop at full acceleration, with a pause between them
 MIN_STOPS = 4  # fewer do not show a scatter
 LISTEN_S = 2.0  # longer: more noise; shorter: the slowest ringing does not die down
-DELAYS_S = (0.015, 0.03, 0.05, 0.08)
-"""Times after the end of the profile from which the rate is fitted: a shaft that lags behind stops later."""
+DELAY_S = 0.015
+"""Time after the end of the profile from which the rate is fitted: the gyro's own filter is past it."""
 HZ, DAMPING = np.geomspace(3.0, 40.0, 80), np.array([0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4])
+LAGS_S = (0.02, 0.045, 0.1)
 """Where the fit begins."""
 MAX_RESIDUAL = 3.0
 """Largest scatter about the fit, in that of its end: more is a second oscillation, or a hand."""
@@ -91,7 +93,7 @@ class Ringing(Procedure):
         require_at_least(MIN_STOPS, self.stops, "stops")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        stops = []
+        stops, held_deg = [], []
         with Turntable(bench, approach_deg=0.0, ringing_hz=0.0, quiet_dps=10.0) as table:
             base_deg = lower_end(bench, table.rest_deg, SWING_DEG)
             with returning(table) as goto:
@@ -102,37 +104,46 @@ class Ringing(Procedure):
                         bench.clock.sleep(0.2)
                         table.collect_gyro()
                     stops.append(Stop.of(table.moves[-1]))
+                    held_deg.append(abs(move.commanded_deg - move.encoder_deg))
                     yield moved(index, move)
-        yield evaluate(stops)
+        yield evaluate(stops, float(np.median(held_deg)))
 
 
-def evaluate(stops: Sequence[Stop]) -> Evaluation:
-    """Fit frequency and damping to the rates after ``stops``."""
+def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
+    """Fit frequency, damping and lag to the rates after ``stops``.
+
+    ``held_deg`` is the distance from its goal at which the shaft rested.
+    """
     found = Evaluation(name=NAME, residual_unit="σ", limit=MAX_RESIDUAL)
-    # A shaft that lags behind its profile still moves at first: then the model fits only later.
-    for delay_s in DELAYS_S:
-        used = [stop.since(delay_s) for stop in stops]
-        hz, damping = _fit(used)
-        squares = np.square(_residuals(used, hz, damping))
-        noise_dps = sqrt(float(squares[np.concatenate([stop.time_s for stop in used]) > 0.8 * LISTEN_S].mean()))
-        found.residual = residual = sqrt(float(squares.mean())) / noise_dps
-        if residual <= MAX_RESIDUAL / 2:
-            break
-    peak_dps = float(np.median([np.abs(stop.rate_dps - stop.rate_dps[-20:].mean()).max() for stop in used]))
-    found.evidence = {"stops": len(stops), "delay_s": delay_s, "noise_dps": noise_dps, "peak_dps": peak_dps}
+    used = [stop.since(DELAY_S) for stop in stops]
+    hz, damping, lag_s = fitted = _fit(used)
+    parts = [_parts(stop, *fitted) for stop in used]
+    squares = np.square(_residuals(used, *fitted))
+    noise_dps = sqrt(float(squares[np.concatenate([stop.time_s for stop in used]) > 0.8 * LISTEN_S].mean()))
+    found.residual = residual = sqrt(float(squares.mean())) / noise_dps
+    peak_dps, tail_dps = (float(np.median([np.abs(part[i]).max() for part in parts])) for i in range(2))
+    found.evidence = {"stops": len(stops), "noise_dps": noise_dps, "peak_dps": peak_dps, "tail_dps": tail_dps}
     if peak_dps < MIN_PEAK * noise_dps:
         return found.reject(RejectionCode.NO_RINGING, peak_dps=peak_dps, noise_dps=noise_dps)
-    without = np.array([_fit([*used[:i], *used[i + 1 :]], (hz, damping)) for i in range(len(used))])
+    without = np.array([_fit([*used[:i], *used[i + 1 :]], fitted) for i in range(len(used))])
     sigma = np.sqrt((len(used) - 1) * without.var(axis=0))
     found.estimate("frequency", hz, sigma[0], "Hz")
     found.estimate("damping", damping, sigma[1])
+    lags = tail_dps > MIN_PEAK * noise_dps  # else its time is that of noise
+    if lags:
+        found.estimate("lag", lag_s, sigma[2], "s")
     first = used[0]
     found.evidence["stop"] = {
         "time_s": first.time_s.round(4).tolist(),
         "rate_dps": first.rate_dps.round(3).tolist(),
-        "model_dps": (first.rate_dps - _residuals([first], hz, damping)).round(3).tolist(),
+        "model_dps": (first.rate_dps - _residuals([first], *fitted)).round(3).tolist(),
     }
-    found.proposed = {"table.ringing_hz": round(hz, 3), "table.ringing_damping": round(damping, 4)}
+    found.proposed = {
+        "table.ringing_hz": round(hz, 3),
+        "table.ringing_damping": round(damping, 4),
+        "table.lag_s": round(lag_s, 4) if lags else 0.0,
+        "table.held_deg": round(held_deg, 3),
+    }
     found.reject_if(residual > MAX_RESIDUAL, RejectionCode.RINGING_UNCLEAR, residual=residual)
     found.reject_if(
         sigma[0] > MAX_UNCERTAINTY * hz, RejectionCode.RINGING_UNCERTAIN, hz=hz, uncertainty_hz=float(sigma[0])
@@ -140,23 +151,30 @@ def evaluate(stops: Sequence[Stop]) -> Evaluation:
     return found
 
 
-def _fit(stops: Sequence[Stop], start: tuple[float, float] | None = None) -> tuple[float, float]:
-    """Return frequency and damping; without a start, from the best of a grid."""
+def _fit(stops: Sequence[Stop], start: tuple[float, float, float] | None = None) -> tuple[float, float, float]:
+    """Return frequency, damping and lag; without a start, from the best of a grid."""
     if start is None:
-        grid = [(float(hz), float(damping)) for hz in HZ for damping in DAMPING]
+        grid = [(float(hz), float(damping), lag_s) for hz in HZ for damping in DAMPING for lag_s in LAGS_S]
         start = min(grid, key=lambda at: float(np.square(_residuals(stops[:2], *at)).sum()))
     solved = least_squares(
-        lambda p: _residuals(stops, *p), start, bounds=((1.0, 0.001), (80.0, 0.9)), x_scale=(start[0], 0.05)
+        lambda p: _residuals(stops, *p),
+        start,
+        bounds=((1.0, 0.001, 0.005), (80.0, 0.9, 0.3)),
+        x_scale=(start[0], 0.05, 0.02),
     )
-    return float(solved.x[0]), float(solved.x[1])
+    hz, damping, lag_s = solved.x.tolist()
+    return hz, damping, lag_s
 
 
-def _residuals(stops: Sequence[Stop], hz: float, damping: float) -> Floats:
+def _residuals(stops: Sequence[Stop], hz: float, damping: float, lag_s: float) -> Floats:
     """Return the deviations of all rates from the model with the best amplitudes and biases."""
-    parts = []
-    for stop in stops:
-        t = stop.time_s
-        swing = np.exp(2 * pi * hz * complex(-damping, sqrt(1 - damping**2)) * t)
-        design = np.column_stack([swing.real, swing.imag, np.ones_like(t)])
-        parts.append(stop.rate_dps - design @ np.linalg.lstsq(design, stop.rate_dps, rcond=None)[0])
-    return np.concatenate(parts)
+    return np.concatenate([stop.rate_dps - sum(_parts(stop, hz, damping, lag_s)) for stop in stops])
+
+
+def _parts(stop: Stop, hz: float, damping: float, lag_s: float) -> tuple[Floats, Floats, Floats]:
+    """Return the parts of a stop's rate by the model: the ringing, the shaft's own motion, and the bias."""
+    t = stop.time_s
+    swing = np.exp(2 * pi * hz * complex(-damping, sqrt(1 - damping**2)) * t)
+    design = np.column_stack([swing.real, swing.imag, np.exp(-t / lag_s), np.ones_like(t)])
+    amounts = np.linalg.lstsq(design, stop.rate_dps, rcond=None)[0]
+    return design[:, :2] @ amounts[:2], design[:, 2] * amounts[2], design[:, 3] * amounts[3]

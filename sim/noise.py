@@ -18,10 +18,10 @@ class NoiseModel:
     # Servo and table: XL430-W250 e-manual, measured backlash of its gears.
     backlash_deg: float = 0.25
     """Backlash between shaft and platter, full width."""
-    servo_lag: float = 0.0
+    servo_lag: float = 1.0
     """Lag of the shaft behind its motion profile, as a share of what the gains of its position controller give: 1 is a
     real servo."""
-    servo_friction: float = 0.0
+    servo_friction: float = 0.0254
     """Friction at rest, as a share of the stall torque. 0.0254 is a real XL430: asked for 1000 counts it stops at 995,
     asked for 1450 at 1446 (answers.ros.org 303081), and 885 / 5 counts push with the stall torque."""
     servo_friction_spread: float = 0.2

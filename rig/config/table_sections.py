@@ -44,8 +44,10 @@ class TableConfig(Section):
         le=30,
         description="each stop is approached upwards from at least this far below, which takes up the gears' backlash",
     )
+    # A position controller without an integral part stops where friction equals its push. An XL430 with factory gains
+    # pushes with its stall torque at 15.6°; 2.5 % of that is a usual friction (0.4°), and 6.4 % are accepted.
     tolerance_deg: float = Field(
-        0.6, ge=0.001, le=5, description="largest distance from the goal that counts as arrived"
+        1.0, ge=0.001, le=5, description="largest distance from the goal at which friction may hold an arrived table"
     )
     encoder_harmonics_deg: tuple[Harmonic, Harmonic, Harmonic, Harmonic] = Field(
         (0.0, 0.0, 0.0, 0.0),
@@ -66,6 +68,18 @@ class TableConfig(Section):
         "0: not known",
     )
     ringing_damping: float = Field(0.05, ge=0.001, le=0.9, description="damping ratio of that ringing")
+    lag_s: float = Field(
+        0.0,
+        ge=0,
+        le=0.3,
+        description="time by which the shaft lags behind the profile, from that calibration",
+    )
+    held_deg: float = Field(
+        0.0,
+        ge=0,
+        le=5,
+        description="distance from its goal at which friction holds the shaft, from that calibration",
+    )
     quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
@@ -118,6 +132,7 @@ class MarkConfig(Section):
 class SafetyConfig(Section):
     """When a motion is stopped: before the servo shuts down by itself, and long before something breaks."""
 
+    # An XL430 with factory gains lags by 3.8° at 90 °/s, and by 8.5° at 200 °/s, the fastest table.
     following_error_deg: float = Field(
         12.0,
         ge=0.01,

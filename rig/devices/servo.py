@@ -37,8 +37,8 @@ class ServoState:
     the servo read its encoder, to a fraction of a millisecond; None if the driver does not know it. ``hardware_errors``
     are the names of the bits in Hardware Error Status (a status alert). ``moving`` is False when the motion profile has
     ended and the shaft is slow. ``in_position`` is whether the servo reports that it is at its goal; friction may hold
-    it outside of its window. ``trajectory_deg`` is the present position of the servo's motion profile; None if the
-    model does not report it.
+    it outside of its window. ``trajectory_deg`` and ``trajectory_dps`` are the present position and speed of the
+    servo's motion profile, which the shaft follows with a lag; None if the model does not report them.
     """
 
     time_ns: int
@@ -51,6 +51,7 @@ class ServoState:
     in_position: bool
     hardware_errors: tuple[str, ...]
     trajectory_deg: float | None = None
+    trajectory_dps: float | None = None
     sampled_ns: int | None = None
 
 

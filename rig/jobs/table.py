@@ -148,7 +148,7 @@ def jog(desk: Desk, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -> 
                         case JogKey.HOME:
                             target_deg = 0.0
                         case _:
-                            # From the last target: friction holds the table short of it, and steps must not add that up.
+                            # From the last target: friction holds the table short of it; steps must not add that up.
                             target_deg += step_deg if key is JogKey.FORWARD else -step_deg
                     low_deg, high_deg = table.limits_deg
                     target_deg = min(max(target_deg, low_deg), high_deg)

@@ -73,14 +73,34 @@ def quiet_deg(servo: Servo) -> float:
     return max(QUIET_COUNTS * servo.resolution_deg, QUIET_DEG)
 
 
+def stopping_deg(state: ServoState, ramp_dps2: float, later_s: float, trusted_lag_deg: float) -> float:
+    """Return the servo's position at which a motion ends that brakes ``later_s`` after a reading.
+
+    It is the servo's profile that brakes, and the shaft follows it with a lag. To a goal computed from the shaft, the
+    profile could not brake in time: the table would overshoot and come back. The shaft counts if the servo does not
+    report its profile, or one that is farther away than it can be from a table that follows it. Then a goal from the
+    profile would rotate the table on, against what blocks it, or to where a false reading says.
+    """
+    angle_deg, rate_dps = state.position_deg, state.velocity_dps
+    if state.trajectory_deg is not None and abs(state.trajectory_deg - angle_deg) <= trusted_lag_deg:
+        angle_deg = state.trajectory_deg
+        rate_dps = rate_dps if state.trajectory_dps is None else state.trajectory_dps
+    return angle_deg + copysign(rate_dps**2 / (2 * ramp_dps2), rate_dps) + rate_dps * later_s
+
+
 def halt(
-    servo: Servo, clock: Clock, set_goal: Callable[[float], None], path: MotionPath, ramp_dps2: float, poll_s: float
+    servo: Servo,
+    clock: Clock,
+    set_goal: Callable[[float], None],
+    path: MotionPath,
+    ramp_dps2: float,
+    trusted_lag_deg: float,
+    poll_s: float,
 ) -> bool:
     """Bring the table to a stop along its ramp; return False if the servo does not answer (its watchdog stops it).
 
-    The goal is ahead of the table by its stopping distance, but never beyond the path of the motion. With its present
-    position as the goal, the table would overshoot and come back. Without two readings that agree, the position is not
-    known; then the torque goes off and the table stops by friction.
+    The goal is that of `stopping_deg`, but never beyond the path of the motion. Without two readings that agree, the
+    position is not known; then the torque goes off and the table stops by friction.
     """
     try:
         state = _agreed_reading(servo, clock, path)
@@ -89,12 +109,12 @@ def halt(
             if servo.read_condition().watchdog_armed:  # or the next program would find it armed
                 servo.disarm_watchdog()
             return True
-        ramp_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
         bus_s = 2 * min(seconds_between(state.time_ns, clock.now_ns()), STALE_S)  # for the answer and the goal
         low_deg, high_deg = path.ends_deg
-        set_goal(min(max(state.position_deg + ramp_deg + state.velocity_dps * bus_s, low_deg), high_deg))
-        deadline_ns = clock.now_ns() + round((abs(state.velocity_dps) / ramp_dps2 + STOP_ALLOWANCE_S) * 1e9)
-        while state.moving and clock.now_ns() < deadline_ns:
+        set_goal(min(max(stopping_deg(state, ramp_dps2, bus_s, trusted_lag_deg), low_deg), high_deg))
+        fastest_dps = max(abs(state.velocity_dps), abs(state.trajectory_dps or 0.0))
+        deadline_ns = clock.now_ns() + round((fastest_dps / ramp_dps2 + STOP_ALLOWANCE_S) * 1e9)
+        while (state.moving or state.velocity_dps) and clock.now_ns() < deadline_ns:
             clock.sleep(poll_s)
             state = servo.read_state()
         servo.disarm_watchdog()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from math import copysign, isfinite, remainder
+from math import isfinite, log, pi, remainder
 from typing import Self
 
 import numpy as np
@@ -21,7 +21,7 @@ from rig.core.next_steps import START_AGAIN
 from rig.core.phrases import angle_words, budget_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
-from rig.motion.arrival import Arrival, MotionPath, causes_found, halt, quiet_deg
+from rig.motion.arrival import Arrival, MotionPath, causes_found, halt, quiet_deg, stopping_deg
 from rig.motion.move import FIRST_REST_S, Move, equivalent_within, motion_seconds
 from rig.motion.shaper import shaped
 from rig.motion.traces import KEPT, MoveTrace, store
@@ -32,6 +32,8 @@ from rig.safety.supervisor import Motion, TableState
 
 SETTLE_ALLOWANCE_S = 2.5  # larger: a table that shakes is reported late; smaller: a heavy object never rests in time
 """Time for ringing to die down and for a slow bus, in addition to the motion."""
+RINGING_DPS = 10.0
+"""Largest rate of a ringing whose frequency and damping are known, after the shaft broke away from its friction."""
 ROUND_S = 0.03  # longer: a shaped motion is watched less closely; shorter: its parts begin late
 """Longest time that a round of the control loop takes besides its pause."""
 GYRO_LAG_S = 0.012
@@ -115,9 +117,13 @@ class Turntable(AbstractContextManager["Turntable"]):
         )
         self._profile: MotionProfile | None = None
         self._usual = MotionProfile(self._config.velocity_dps, self._config.acceleration_dps2)
-        self._rest_deg = self._shaft_deg = 0.0
+        self._rest_deg = self._profile_deg = self._behind_deg = 0.0
         self._path = MotionPath((0.0, 0.0), self._config.velocity_dps)
         self._arrival_at = partial(Arrival, self._servo, self._gyro, self._clock, self._config)
+        self._settle_s = SETTLE_ALLOWANCE_S
+        if self._config.ringing_hz:
+            fades_s = 1 / (2 * pi * self._config.ringing_hz * self._config.ringing_damping)
+            self._settle_s += fades_s * log(RINGING_DPS / self._config.quiet_dps)
         self._backlash_taken_up = False
         self._state = bench.state
         self.moves: deque[MoveTrace] = deque(maxlen=KEPT)
@@ -129,7 +135,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._servo.torque_on()
             # After torque on, which clears the watchdog: a watchdog that trips resets the profile to unlimited.
             self._profile = self._usual = self._servo.set_profile(self._usual)
-            self._wait_for_rest(self.angle_deg(), self._config.quiet_s, SETTLE_ALLOWANCE_S)
+            self._wait_for_rest(self.angle_deg(), self._config.quiet_s, self._settle_s)
             self._learn_bias(self._first_rest_s)
         except BaseException:
             self.__exit__(None, None, None)
@@ -206,7 +212,7 @@ class Turntable(AbstractContextManager["Turntable"]):
     def hold(self) -> Move:
         """Stay, and return when the table is at rest: a move without rotation, before a first view."""
         rotation = self._begin()
-        self._wait_for_rest(self._rest_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
+        self._wait_for_rest(self._rest_deg, self._config.quiet_s, self._settle_s)
         return self._end(rotation, rotation.start_deg)
 
     def goto(self, target_deg: float) -> Move:
@@ -267,12 +273,11 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def stopping_deg(self, state: ServoState) -> float:
         """Return where the table stops if it brakes now, as a table angle within the limits."""
-        rate_dps = self._config.direction * state.velocity_dps
         age_s = seconds_between(state.time_ns, self._clock.now_ns()) + self._config.poll_s / 2
-        ramp_deg = copysign(rate_dps**2 / (2 * self._torque_profile().acceleration_dps2), rate_dps) + rate_dps * age_s
+        ramp_dps2 = self._torque_profile().acceleration_dps2
+        servo_deg = stopping_deg(state, ramp_dps2, age_s, self._limits.following_error_deg)
         low_deg, high_deg = self._config.limits_deg
-        here_deg = self._safety.angle_reference.to_table(state.position_deg)
-        return min(max(here_deg + ramp_deg, low_deg), high_deg)
+        return min(max(self._safety.angle_reference.to_table(servo_deg), low_deg), high_deg)
 
     def collect_gyro(self) -> None:
         """Collect the gyro's samples: its buffer is shorter than the time that a slow camera may take."""
@@ -308,7 +313,7 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def _learn_bias(self, duration_s: float) -> None:
         """Measure the gyro's bias; try again after a short disturbance, and fail if the bench keeps shaking."""
-        deadline_ns = self._clock.now_ns() + round(SETTLE_ALLOWANCE_S * 1e9)
+        deadline_ns = self._clock.now_ns() + round(self._settle_s * 1e9)
         while True:
             try:
                 self._gyro.rest(duration_s)
@@ -365,7 +370,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         if config.ringing_hz:
             step_deg = self._servo.resolution_deg  # the servo rounds its goal; a hundredth of a degree matters
             shaft_deg = round(self._safety.angle_reference.to_servo(goal_deg) / step_deg) * step_deg
-            plan = shaped(shaft_deg - self._shaft_deg, self._usual, self._servo.profile_units, config)
+            distance_deg, units = shaft_deg - self._profile_deg, self._servo.profile_units
+            plan = shaped(distance_deg, self._usual, units, config, behind_deg=self._behind_deg)
         asked_ns = clock.now_ns()
         if plan is None:
             self._use(self._usual)
@@ -386,8 +392,8 @@ class Turntable(AbstractContextManager["Turntable"]):
 
         # The readings at the end follow the motion closely, so that a table at rest is not waited for.
         ends_s = plan.seconds + GYRO_LAG_S
-        quiet_s += ends_s + GYRO_LAG_S / 4
-        times_s = (ends_s, quiet_s, quiet_s + plan.rings_s)
+        rests_s = ends_s + quiet_s + GYRO_LAG_S / 4
+        times_s = (ends_s, rests_s, rests_s + plan.rings_s) if quiet_s else (ends_s,)
         if plan.slow != plan.cruise:
             rotation.due.append((begun_ns + round((plan.slow_s - asking_s) * 1e9), slow_down))
         rotation.due.extend((begun_ns + round(after_s * 1e9), lambda: None) for after_s in times_s)
@@ -466,7 +472,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         )
 
     def _allowed_s(self, distance_deg: float) -> float:
-        return 1.5 * motion_seconds(distance_deg, self._torque_profile()) + SETTLE_ALLOWANCE_S
+        return 1.5 * motion_seconds(distance_deg, self._torque_profile()) + self._settle_s
 
     def _wait_for_rest(
         self, goal_deg: float, quiet_s: float, allowed_s: float, rotation: _Rotation | None = None
@@ -476,7 +482,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         The polling also feeds the servo's watchdog.
         """
         arrival, rest_deg = self._arrival_at(goal_deg, quiet_s, allowed_s), None
-        while rest_deg is None:
+        # A shaped motion that another one follows must end: the shaft still moves when its profile has ended.
+        while rest_deg is None or (rotation is not None and rotation.due and not quiet_s):
             self._pause(rotation)
             state, angle_deg = self._read()
             self._check(state, angle_deg, rotation)
@@ -515,7 +522,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         for observer in self._safety.observers:
             observer(state)
         self._path.add(state)
-        self._shaft_deg = state.position_deg if state.trajectory_deg is None else state.trajectory_deg
+        self._profile_deg = state.position_deg if state.trajectory_deg is None else state.trajectory_deg
+        self._behind_deg = self._profile_deg - state.position_deg
         self._gyro.update(now=gyro_now)
         to_table = self._safety.angle_reference.to_table
         angle_deg = to_table(state.position_deg)
@@ -538,5 +546,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 slip.compare(rotation_deg, self._gyro.since_rest(at_ns))
 
     def _stop(self) -> bool:
-        ramp_dps2 = (self._profile or self._config).acceleration_dps2
-        return halt(self._servo, self._clock, self._safety.set_goal, self._path, ramp_dps2, self._config.poll_s)
+        ramp_dps2, lag_deg = (self._profile or self._config).acceleration_dps2, self._limits.following_error_deg
+        return halt(
+            self._servo, self._clock, self._safety.set_goal, self._path, ramp_dps2, lag_deg, self._config.poll_s
+        )

@@ -255,7 +255,7 @@ def _slip(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End
 @simulated_fault(
     "friction",
     "Friction and a steady load hold the table. It rests short of its goal, outside the servo's in-position window.",
-    friction=Parameter(0.025, "friction, as a share of the stall torque", 0, 1),
+    friction=Parameter(0.05, "friction, as a share of the stall torque", 0, 1),
     load=Parameter(0.005, "steady load that rotates clockwise, as a share of the stall torque", -1, 1),
 )
 def _friction(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:

@@ -86,6 +86,11 @@ class Motor:
         return self.driven and (self._jammed or moves)
 
     @property
+    def held_deg(self) -> float:
+        """Distance from its goal at which friction holds the shaft."""
+        return self._model.stall_error_deg * self._friction
+
+    @property
     def overloaded(self) -> bool:
         return self._overloaded_s >= OVERLOAD_S
 
@@ -206,8 +211,8 @@ class Motor:
         if self._jammed:
             return
         if self.driven and (self._lag_s or self._friction):
-            half_deg, offset_deg = (self._model.stall_error_deg * part for part in (self._friction, -self._steady_load))
-            response = Response(self._lag_s, self._model.inertia_s, half_deg, offset_deg, self.fastest_dps)
+            offset_deg = -self._model.stall_error_deg * self._steady_load
+            response = Response(self._lag_s, self._model.inertia_s, self.held_deg, offset_deg, self.fastest_dps)
             path = response.follow(path, *self._world.shaft())
         self._still_s = path.end_s
         self._world.drive(path)

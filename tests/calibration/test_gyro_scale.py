@@ -15,6 +15,7 @@ from rig.motion.turntable import Turntable
 from sim.imu.inertial import InertialModel
 from sim.world import World
 from tests.calibration.rejected import codes
+from tests.rig.bench_parts import at_rest
 
 COUNT_DEG = 360 / 4096
 SLIP_DELAY_NS = 4_000_000_000
@@ -186,7 +187,7 @@ def test_table_returns_at_the_end_and_when_closed_between_moves(simulated):
             next(events)
             assert abs(s.world.shaft()[0] - 40.0) > 100
             events.close()
-        assert s.world.shaft()[0] == pytest.approx(40.0, abs=0.3)
+        assert s.world.shaft()[0] == at_rest(s.operator.devices.servo, 40.0)
         assert torque(s) == 0
 
 

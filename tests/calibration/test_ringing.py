@@ -10,11 +10,11 @@ from rig.core.errors import MotionTimeout, UsageError
 from rig.motion.turntable import Turntable
 from sim.noise import NoiseModel
 from tests.calibration.rejected import codes
-from tests.rig.bench_parts import motion_bench
+from tests.rig.bench_parts import LAG_S, at_rest, motion_bench
 
-TABLES = [(6.0, 0.02), (6.0, 0.2), (9.0, 0.06), (13.0, 0.15), (20.0, 0.02), (20.0, 0.1)]
+TABLES = [(6.0, 0.02), (6.0, 0.2), (9.0, 0.06), (13.0, 0.15), (20.0, 0.02)]
 """Frequency and damping of the simulated platter."""
-TARGETS_DEG = (40.0, 85.0, 95.0, 190.0, 150.0, 20.0)
+UPWARDS_DEG, DOWNWARDS_DEG = (40.0, 85.0, 95.0, 190.0), (150.0, 20.0)
 
 
 def drawn(rng: np.random.Generator, hz: float, damping: float) -> list[Stop]:
@@ -24,15 +24,18 @@ def drawn(rng: np.random.Generator, hz: float, damping: float) -> list[Stop]:
     return [Stop(time_s, (phase * swing).real + rng.normal(0, 0.04, time_s.size)) for phase in phases]
 
 
-def settling_s(bench, world, **ringing) -> list[float]:
-    """Return the times from the end of the shaft's motion until the table counts as at rest."""
+def settling_s(bench, wires, targets_deg, **ringing) -> list[float]:
+    """Return the times from when the shaft is slower than a table at rest may be, until the table counts as at rest."""
     found = []
     with Turntable(bench, **ringing) as table:
-        for target in TARGETS_DEG:
+        for target in targets_deg:
             table.goto(target)
             rest_s = table.moves[-1].readings[-1][0] * 1e-9
-            found.append(rest_s - world._motions[-1][1].shaft.end_s)
-            assert abs(table.rest_deg - target) < 0.2
+            times = np.arange(rest_s - 5.0, rest_s, 0.001)
+            speeds = [abs(wires.world.shaft(round(time * 1e9))[1]) for time in times]
+            moves = np.flatnonzero(np.greater(speeds, bench.config.table.quiet_dps))
+            found.append(rest_s - float(times[moves[-1]]))
+            assert table.rest_deg == at_rest(wires.device, target, 0.2)
     return found
 
 
@@ -42,10 +45,26 @@ def test_calibrated_table_is_at_rest_at_once(hz, damping):
         *_, found = Ringing(6).measure(bench)
         assert isinstance(found, Evaluation)
         assert found.passed, found.rejections
-        assert found.estimates["frequency"].value == pytest.approx(hz, rel=0.005)
+        # The lag of the servo excites the platter less: its ringing is known a little less well.
+        assert found.estimates["frequency"].value == pytest.approx(hz, rel=0.01)
         assert found.estimates["damping"].value == pytest.approx(damping, rel=0.05)
+        assert found.estimates["lag"].value == pytest.approx(LAG_S, rel=0.05)
         ringing = {key.removeprefix("table."): value for key, value in found.settings.items()}
-        assert max(settling_s(bench, wires.world, **ringing)) < 0.15
+        assert ringing["held_deg"] == pytest.approx(wires.device.motor.held_deg, abs=0.05)
+        assert max(settling_s(bench, wires, UPWARDS_DEG, **ringing)) < 0.15
+        # Before its approach from below, friction holds the shaft. When it breaks away, the platter gets a push that is
+        # known as well as the friction: to some 0.2°. It dies down with the platter's damping.
+        omega = 2 * np.pi * hz
+        dies_down_s = np.log(omega * 0.2 / bench.config.table.quiet_dps) / (damping * omega)
+        assert max(settling_s(bench, wires, DOWNWARDS_DEG, **ringing)) < 0.15 + dies_down_s
+
+
+def test_ringing_that_the_lag_of_the_servo_does_not_excite_needs_no_calibration():
+    with motion_bench(noise=NoiseModel(structure_hz=20.0, structure_damping=0.1), seed=3) as (bench, wires):
+        *_, found = Ringing(6).measure(bench)
+        assert codes(found) == [RejectionCode.NO_RINGING]
+        times_s = settling_s(bench, wires, UPWARDS_DEG + DOWNWARDS_DEG)
+        assert max(times_s) < 0.15 + 2 * bench.config.table.poll_s
 
 
 def test_table_with_little_damping_never_rests_without_calibration():
@@ -54,7 +73,7 @@ def test_table_with_little_damping_never_rests_without_calibration():
         motion_bench(noise=noise, seed=3) as (bench, wires),
         pytest.raises(MotionTimeout, match="did not come to rest"),
     ):
-        settling_s(bench, wires.world)
+        settling_s(bench, wires, UPWARDS_DEG)
 
 
 def test_true_values_lie_within_the_stated_uncertainty():

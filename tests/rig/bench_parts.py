@@ -5,6 +5,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+import pytest
+
 from rig.bench import Bench
 from rig.config import load_config
 from rig.core.errors import RigError
@@ -55,6 +57,17 @@ def open_servo(wires: Wires, **options: Any) -> DynamixelServo:
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock, **options)
     servo.prepare(write=True)
     return servo
+
+
+def at_rest(servo: XSeriesServo, goal_deg: float, error_deg: float = 0.3) -> Any:
+    """Return what an angle at rest equals after a motion upwards to a goal: friction holds the table short of it."""
+    return pytest.approx(goal_deg - servo.motor.held_deg, abs=error_deg)
+
+
+LAG_S = 885 / 5 * 360 / 4096 / (61 * 6)
+"""Lag of an XL430 behind its profile: the gain is 5 PWM for each count of error, and 885 are 61 rev/min."""
+BRAKED_S = 8.5 * LAG_S
+"""Time after the end of a profile until a shaft that was at 90 °/s stands still."""
 
 
 @contextmanager

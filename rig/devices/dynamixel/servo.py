@@ -212,6 +212,7 @@ class DynamixelServo:
             in_position=bool(values["Moving Status"] & 1),
             hardware_errors=self._hardware_errors() if self.bus.alert(self._id) else (),
             trajectory_deg=values["Position Trajectory"] * self.resolution_deg,
+            trajectory_dps=values["Velocity Trajectory"] * self._dps_per_unit,
         )
 
     def read_condition(self) -> ServoCondition:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rig.motion.trajectory import TrajectoryRecorder, backlash_states
 from rig.motion.turntable import Flight, Turntable
 from tests.fuzzing import examples
-from tests.rig.bench_parts import motion_bench
+from tests.rig.bench_parts import at_rest, motion_bench
 from tests.sim.truth import table_rates
 
 CENTER_DEG = 180.0
@@ -184,7 +184,7 @@ def test_goal_beyond_the_reach_of_a_flight_is_moved_into_it_and_the_usual_speed_
 
         move = table.fly(60.0, Flight(each, (0.0, 70.0), table.recorder(), 45.0))
         assert move.commanded_deg == 70.0
-        assert move.encoder_deg == pytest.approx(70.0, abs=0.3)
+        assert move.encoder_deg == at_rest(wires.device, 70.0)
         assert usual not in speeds
         assert wires.device.memory["Profile Velocity"] == usual
 

@@ -60,7 +60,7 @@ def test_fault_in_a_motion_stops_the_table_and_latches(name):
             except error:
                 # Found, and stopped: the ramp from 90 °/s takes 0.375 s.
                 assert (clock.now_ns() - begun_ns[0]) * 1e-9 < within_s + 0.6
-                assert wires.world.shaft()[1] == 0
+                assert abs(wires.world.shaft()[1]) < bench.servo.profile_units.velocity_dps / 2  # it reads 0
                 raise
         assert bench.safety.state is TableState.FAULT
         assert bench.safety.fault.code == caught.value.code

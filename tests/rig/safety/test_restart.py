@@ -29,7 +29,7 @@ from rig.safety.saved_state import FileStore
 from rig.safety.supervisor import TableState
 from sim.faults.environment import fill_disk
 from sim.servo import XSeriesServo
-from tests.rig.bench_parts import Wires, kill, program, sensor, servo_wires
+from tests.rig.bench_parts import BRAKED_S, Wires, at_rest, kill, program, sensor, servo_wires
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def test_servo_stops_after_sigkill_and_the_next_program_reports_it(start, wires)
         killed_in_motion(bench, wires, 300.0, after_s=1.2)
         watchdog_s = bench.config.table.watchdog_s
     assert wires.world.shaft()[1] > 50  # it rotates on without its program
-    wires.world.clock.sleep(watchdog_s + 0.15)  # the ramp of a stop as fast as it can
+    wires.world.clock.sleep(watchdog_s + 0.15 + BRAKED_S)  # the ramp of a stop as fast as it can
     assert wires.world.shaft()[1] == 0
     assert wires.device.memory["Torque Enable"] == 1
     assert wires.device.memory["Bus Watchdog"] == 0xFF
@@ -118,7 +118,7 @@ def test_servo_stops_after_sigkill_and_the_next_program_reports_it(start, wires)
         with Turntable(bench) as table:
             assert wires.world.shaft()[0] == pytest.approx(stands_deg, abs=0.1)
             assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
-            assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+            assert table.goto(0.0).encoder_deg == at_rest(wires.device, 0.0)
     assert wires.device.memory["Torque Enable"] == 0
 
 
@@ -140,7 +140,7 @@ def test_sigkill_and_power_cut_need_a_new_reference(start, wires):
         with Turntable(bench) as table:
             assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
             table.goto(0.0)
-        assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
+        assert wires.world.shaft()[0] == at_rest(wires.device, 0.0)
 
 
 def test_power_cut_between_programs_loses_no_revolution(start, wires):
@@ -149,12 +149,12 @@ def test_power_cut_between_programs_loses_no_revolution(start, wires):
     wires.device.power_cycle()
     wires.world.clock.sleep(1.0)
     with start() as bench:
-        assert bench.servo.read_state().position_deg == pytest.approx(170.0, abs=0.3)
+        assert bench.servo.read_state().position_deg == at_rest(wires.device, 170.0)
         assert "lost its supply and 1 of its revolutions" in bench.findings[0]
         with Turntable(bench) as table:
-            assert table.rest_deg == pytest.approx(-370.0, abs=0.3)
+            assert table.rest_deg == at_rest(wires.device, -370.0)
             table.goto(-360.0)
-        assert wires.world.shaft()[0] == pytest.approx(-360.0, abs=0.3)
+        assert wires.world.shaft()[0] == at_rest(wires.device, -360.0)
     with start() as bench:  # the restored state is stored
         assert not bench.findings
         assert bench.safety.state is TableState.READY
@@ -171,9 +171,8 @@ def test_restored_revolutions_survive_a_kill_at_rest(start, wires):
         kill(wires)
     with start() as bench:
         assert bench.safety.state is TableState.READY
-        assert bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg) == pytest.approx(
-            -370.0, abs=0.3
-        )
+        position_deg = bench.servo.read_state().position_deg
+        assert bench.safety.angle_reference.to_table(position_deg) == at_rest(wires.device, -370.0)
 
 
 def test_rotation_by_hand_is_counted_with_supply_and_needs_a_new_reference_without(start, wires):
@@ -183,7 +182,7 @@ def test_rotation_by_hand_is_counted_with_supply_and_needs_a_new_reference_witho
     with start() as bench:
         assert "by hand" in bench.findings[0]
         with Turntable(bench) as table:
-            assert table.rest_deg == pytest.approx(60.0, abs=0.3)
+            assert table.rest_deg == at_rest(wires.device, 60.0)
     wires.world.clock.sleep(wires.device.rotate_by_hand(-30.0))
     wires.device.power_cycle()
     wires.world.clock.sleep(1.0)
@@ -221,7 +220,7 @@ def test_unplugged_cable_ends_the_motion_and_nothing_moves_afterwards(start, wir
         assert wires.world.shaft() == (stands_deg, 0.0)
         with Turntable(bench) as table:  # asked for, and after a look at who is there
             assert wires.world.shaft() == (stands_deg, 0.0)
-            assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+            assert table.goto(0.0).encoder_deg == at_rest(wires.device, 0.0)
 
 
 @pytest.mark.parametrize("other", [{"model": "xm430_w350"}, {"firmware": 44}])
@@ -245,7 +244,7 @@ def test_watchdog_of_a_running_program_leaves_no_fault(start, wires):
         assert bench.safety.fault is None
         assert wires.device.memory["Torque Enable"] == 0
         with Turntable(bench) as table:
-            assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+            assert table.goto(0.0).encoder_deg == at_rest(wires.device, 0.0)
 
 
 def test_fault_survives_the_program_until_it_is_acknowledged(start, wires):
@@ -283,7 +282,7 @@ def test_hardware_error_needs_a_reboot_that_loses_no_revolution(start, wires):
         with Turntable(bench) as table:
             assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
             table.goto(0.0)
-        assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
+        assert wires.world.shaft()[0] == at_rest(wires.device, 0.0)
 
 
 def test_reboot_with_changed_settings_keeps_the_fault(start, wires):
@@ -454,7 +453,7 @@ def test_replugged_adapter_is_opened_again_and_checked(simulated, when):
     assert s.world.shaft() == stands
     with Turntable(s.bench) as table:
         assert s.world.shaft() == stands
-        assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+        assert table.goto(0.0).encoder_deg == at_rest(s.operator.devices.servo, 0.0)
     with pytest.raises(DeviceSilent), Turntable(s.bench) as table:
         adapter.unplug()
         table.goto(60.0)
