@@ -11,7 +11,9 @@ import pytest
 from rig.config import load_config
 from rig.core.clock import seconds_between
 from rig.core.errors import BenchBusy, DeviceSilent, TorqueStaysOn, UsageError
+from rig.devices.servo import ServoState
 from rig.jobs.stop import stop
+from rig.motion.arrival import stopping_deg
 from rig.motion.turntable import Turntable
 from rig.safety.saved_state import BenchLock, Holder
 from rig.safety.stop_channel import listen
@@ -206,3 +208,18 @@ def test_program_that_does_not_answer_is_signalled_after_two_seconds(tmp_path, m
             with pytest.raises(BenchBusy):
                 stop("sim", config, clock)
             assert not signalled
+
+
+@pytest.mark.parametrize(
+    ("profile", "stops_deg"),
+    [
+        ((104.0, 90.0), 104.0 + 90.0**2 / 480),  # it brakes from where it is, 4° ahead of the shaft
+        ((101.0, 0.0), 101.0),  # it has ended, and the shaft still moves there
+        ((113.0, 90.0), 100.0 + 48.0**2 / 480),  # it goes on without a table that something holds
+        ((460.0, 90.0), 100.0 + 48.0**2 / 480),  # a false reading
+        ((None, None), 100.0 + 48.0**2 / 480),
+    ],
+)
+def test_table_stops_where_its_profile_can_brake_unless_the_table_does_not_follow_it(profile, stops_deg):
+    state = ServoState(0, 100.0, 48.0, 10.0, 12.0, 33.0, True, False, (), *profile)
+    assert stopping_deg(state, 240.0, 0.0, 12.0) == pytest.approx(stops_deg)
