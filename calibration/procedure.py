@@ -197,8 +197,7 @@ def returning(table: Turntable) -> Iterator[Callable[[float], Move]]:
 
     def go_back() -> None:
         table.goto(start_deg)
-        # Friction holds the table short of this measured angle; else each calibration would end a little farther off.
-        table.goto(min(max(2 * start_deg - table.rest_deg, low_deg), high_deg))
+        table.approach(start_deg)
 
     try:
         yield table.goto

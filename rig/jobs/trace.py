@@ -66,6 +66,7 @@ def _rotate(bench: Bench) -> Steps[None]:
         _interrupt(bench, table, start_deg + side * REACH_DEG)
     with Turntable(bench, trust_gyro=not isinstance(bench.imu, _NoImu)) as table:
         yield moved(len(STEPS_DEG), table.goto(start_deg))
+        table.approach(start_deg)
 
 
 def _interrupt(bench: Bench, table: Turntable, target_deg: float) -> None:

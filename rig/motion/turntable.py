@@ -240,6 +240,15 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._arrive(motion)
         return self._end(rotation, target_deg)
 
+    def approach(self, measured_deg: float) -> Move:
+        """Rotate by what is missing to a measured angle, after `goto` it; raises what `goto` raises.
+
+        Friction holds the table short of each goal. Whoever returns to where the table was, with one goal, leaves it a
+        little lower each time.
+        """
+        low_deg, high_deg = self.limits_deg
+        return self.goto(min(max(2 * measured_deg - self._rest_deg, low_deg), high_deg))
+
     def recorder(self) -> TrajectoryRecorder:
         """Return a recorder for the next motions, with what is known about the gyro now."""
         bias_dps, sigma_dps = self._gyro.bias_of_table

@@ -125,6 +125,7 @@ def _two_frames(bench: Bench, *, anyway: bool) -> Generator[Event, None, _Taken]
             move = yield from announced(1, table, target_deg)
             rotated = yield from capture(1, viewer, table, move.settled_ns)
             yield from announced(1, table, start_deg)
+            table.approach(start_deg)
 
     # Compare the two frames: the table must not have changed, the surroundings must not have moved.
     share = agreement = None

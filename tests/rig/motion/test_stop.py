@@ -215,7 +215,7 @@ def test_program_that_does_not_answer_is_signalled_after_two_seconds(tmp_path, m
     [
         ((104.0, 90.0), 104.0 + 90.0**2 / 480),  # it brakes from where it is, 4° ahead of the shaft
         ((101.0, 0.0), 101.0),  # it has ended, and the shaft still moves there
-        ((113.0, 90.0), 100.0 + 48.0**2 / 480),  # it goes on without a table that something holds
+        ((113.0, 90.0), 100.0 + 48.0**2 / 480),  # something holds the table, and the profile continues alone
         ((460.0, 90.0), 100.0 + 48.0**2 / 480),  # a false reading
         ((None, None), 100.0 + 48.0**2 / 480),
     ],

@@ -21,6 +21,7 @@ from rig.views.capture import (
     rejection_text,
 )
 from rig.views.description import ViewDescriber
+from tests.rig.bench_parts import at_rest
 
 
 def attempts_of(simulated, table, viewer) -> list[Attempt]:
@@ -53,7 +54,7 @@ def test_frame_shows_the_table_after_it_came_to_rest(on_the_table):
     move = table.goto(40.0)
     (attempt,) = viewer.attempts(move.settled_ns, table.check_still)
     assert attempt.evidence.exposed_ns >= move.settled_ns
-    assert s.world.table_deg(attempt.evidence.exposed_ns) == pytest.approx(40.0, abs=0.3)
+    assert s.world.table_deg(attempt.evidence.exposed_ns) == at_rest(s.operator.devices.servo, 40.0)
 
 
 def test_delay_inside_the_camera_is_waited_for(on_the_table):

@@ -50,7 +50,7 @@ def test_jog_ends_when_its_terminal_hangs_up(tmp_path: Path) -> None:
     terminal = Terminal(tmp_path, "--step", "2", "--bench", "sim")
     terminal.wait_for(b"q end")
     terminal.press(RIGHT)
-    terminal.wait_for(b"table at 2.0")
+    terminal.wait_for(b"asked 2.0")
     terminal.hang_up()
     assert terminal.program.wait(20) == 128 + signal.SIGHUP
 
