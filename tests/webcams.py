@@ -5,9 +5,11 @@ compares them with the files. The ranges of the controls are not in descriptors:
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import cv2
+import pytest
 
 from rig.devices import v4l2
 from rig.devices.v4l2 import VideoMode
@@ -30,6 +32,17 @@ _PROCESSING_BITS: Final = {
     12: cv2.CAP_PROP_AUTO_WB,
 }
 """Properties by the bits in the descriptors of a camera and of a processing unit (UVC 1.1, 3.7.2.3 and 3.7.2.5)."""
+
+
+RECORDINGS: Final = Path(__file__).parents[2] / "shared/data/recordings/webcams"
+
+
+def recorded(name: str) -> tuple[bytes, bytes]:
+    """Return the descriptors of a webcam, device and configuration; skip the test where their files are missing."""
+    if not RECORDINGS.is_dir():
+        pytest.skip(f"no recordings in {RECORDINGS}")
+    device, configuration = ((RECORDINGS / f"{name}.{part}_desc.bin").read_bytes() for part in ("dev", "cfg"))
+    return device, configuration
 
 
 @dataclass(frozen=True, slots=True)

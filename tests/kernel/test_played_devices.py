@@ -1,7 +1,7 @@
 """The played devices as a USB host sees them, without a virtual machine."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from errno import ENXIO
 
@@ -19,12 +19,15 @@ from sim.servo import ServoBus, SimSerial
 from sim.world import World
 from tests.fuzzing import examples
 from tests.kernel.usb import descriptors
+from tests.kernel.usb.descriptors import Identity
 from tests.kernel.usb.device import TO_HOST, UsbDevice
 from tests.kernel.usb.diolan_u2c import TO_DEVICE, DiolanU2c
 from tests.kernel.usb.ftdi import FtdiAdapter, baud_rate
 from tests.kernel.usb.i2c_tiny_usb import I2cTinyUsb
 from tests.kernel.usb.usbip import Hang, Stall
-from tests.kernel.usb.webcam import CONTROLS, SIZES, Format, Setting, Webcam, encoded
+from tests.kernel.usb.video import Video
+from tests.kernel.usb.webcam import COARSE, HEADER_BYTES, SIZES, Format, Setting, Webcam, encoded
+from tests.webcams import WEBCAMS, recorded
 
 GET_DESCRIPTOR = 6
 
@@ -229,15 +232,77 @@ def test_second_adapter_survives_any_commands(data: bytes) -> None:
 # -- webcam ---------------------------------------------------------------------------------------------------------
 
 
-def test_webcam_has_the_controls_of_its_descriptors(webcam: Webcam) -> None:
-    units = [part for part in descriptors.parts(webcam.configuration) if part[1] == 0x24]
-    camera, processing = (next(part for part in units if part[2] == kind) for kind in (2, 5))
-    bits = int.from_bytes(camera[15:], "little"), int.from_bytes(processing[8:10], "little")
-    # UVC 1.0, tables 3-6 and 3-8: the bit of each selector.
-    camera_bits = {0x02: 1, 0x03: 2, 0x04: 3, 0x06: 5, 0x08: 17}
-    processing_bits = {0x01: 8, 0x04: 9, 0x05: 10, 0x08: 4, 0x0A: 6, 0x0B: 12}
-    assert bits[0] == sum(1 << camera_bits[selector] for unit, selector in CONTROLS if unit == 1)
-    assert bits[1] == sum(1 << processing_bits[selector] for unit, selector in CONTROLS if unit == 2)
+@pytest.fixture(params=WEBCAMS)
+def real(world: World, request: pytest.FixtureRequest) -> Iterator[Webcam]:
+    """Play a webcam by its real descriptors."""
+    device, configuration = recorded(request.param)
+    identity = Identity.read(device, configuration, ("Maker", "Name", "SN0001"))
+    assert identity.device() == device
+    webcam = Webcam(SimCapture(world), RealTime(world.clock), identity, configuration, COARSE)
+    yield webcam
+    webcam.close()
+
+
+RESERVED = 15
+"""This bit of a camera terminal has no meaning; one webcam sets it."""
+
+
+def test_webcam_answers_for_the_controls_of_its_descriptors(webcam: Webcam, real: Webcam) -> None:
+    for one in (webcam, real):
+        answers_for_all_controls(one)
+
+
+def answers_for_all_controls(webcam: Webcam) -> None:
+    bits = (webcam.video.camera[1] & ~(1 << RESERVED), webcam.video.processing[1])
+    assert len(webcam.controls) == sum(map(int.bit_count, bits)) > 0
+    for (unit, selector), known in webcam.controls.items():
+        for number in (Setting.NOW, Setting.LEAST, Setting.MOST, Setting.STEP, Setting.FACTORY):
+            assert len(ask(webcam, 0x21, number, **control(unit, selector))) == known.size
+        assert ask(webcam, 0x21, Setting.SIZE, **control(unit, selector)) == struct.pack("<H", known.size)
+
+
+class Taken:
+    """The host's end of a plug: takes what is delivered, in packets of one size."""
+
+    def __init__(self, packet_bytes: int) -> None:
+        self.packets: list[bytes] = []
+        self._packet_bytes = packet_bytes
+
+    def deliver(self, endpoint: int, produce: Callable[[int], bytes]) -> bool:
+        self.packets += [produce(self._packet_bytes) for _ in range(32)]
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+def test_image_is_divided_into_packets_of_the_alternate_setting(real: Webcam) -> None:
+    """Each packet has a header; after the image's end they are empty."""
+    interface, stream = next(iter(real.video.streams.items()))
+    (form, size), mode = next(one for one in stream.modes.items() if one[1].fourcc == "YUYV")
+    control_transfer(real, 0x21, Setting.SET, 2 << 8, interface, struct.pack("<HBBI", 0, form, size, mode.usual))
+    assert real.mode == mode
+    packet_bytes = max(stream.packet_bytes.values())
+    plug = Taken(packet_bytes)
+    real.plug = plug  # type: ignore[assignment]
+    with real._time.present():
+        real._streaming.set()
+        real._streams += 1
+    real._send(bytes(range(256)) * 40, real._streams)
+    filled = [packet for packet in plug.packets if packet]
+    assert b"".join(packet[HEADER_BYTES:] for packet in filled) == bytes(range(256)) * 40
+    assert [packet[1] & 2 for packet in filled] == [0] * (len(filled) - 1) + [2]  # the last one ends the image
+    assert max(map(len, filled)) == packet_bytes
+    control_transfer(real, 1, 11, 0, interface)
+    assert not real._streaming.is_set()
+
+
+def test_super_speed_gives_each_endpoint_its_companion(real: Webcam) -> None:
+    fast = descriptors.at_super_speed(real.configuration)
+    assert int.from_bytes(fast[2:4], "little") == len(fast)
+    kinds = [part[1] for part in descriptors.parts(fast)]
+    assert kinds.count(descriptors.ENDPOINT) == kinds.count(descriptors.COMPANION)
+    assert Video.described(fast).streams == real.video.streams
 
 
 def control(unit: int, selector: int) -> dict[str, int]:
@@ -270,7 +335,7 @@ def test_webcam_agrees_on_format_and_size(webcam: Webcam, form: Format, size: in
 def test_images_are_the_same_after_their_transfer() -> None:
     ramp = np.linspace(0, 255, 64).astype(np.uint8)
     image = np.dstack([np.tile(levels, (48, 1)) for levels in (ramp, ramp[::-1] // 2, ramp // 2 + 60)])
-    yuyv = np.frombuffer(encoded(image, Format.YUYV), np.uint8).reshape(48, 64, 2)
+    yuyv = np.frombuffer(encoded(image, "YUYV"), np.uint8).reshape(48, 64, 2)
     assert np.abs(cv2.cvtColor(yuyv, cv2.COLOR_YUV2BGR_YUYV).astype(int) - image).max() <= 8
-    mjpg = cv2.imdecode(np.frombuffer(encoded(image, Format.MJPG), np.uint8), cv2.IMREAD_COLOR)
+    mjpg = cv2.imdecode(np.frombuffer(encoded(image, "MJPG"), np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(mjpg.astype(int) - image).max() <= 8

@@ -1,6 +1,7 @@
 """The protocol between the virtual USB host and a played device, without a virtual machine."""
 
 import socket
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from errno import ECONNRESET, EPIPE
@@ -22,7 +23,11 @@ TO_DEVICE = st.binary(max_size=200).flatmap(
         Submit, NUMBERS, st.integers(0, 15), st.just(False), st.just(len(data)), SETUPS, st.just(data)
     )
 )
-REQUESTS = st.lists(TO_HOST | TO_DEVICE | st.builds(Unlink, NUMBERS, NUMBERS), max_size=6)
+PACKETS = st.lists(st.tuples(st.integers(0, 99_999), st.integers(0, 3072)), min_size=1, max_size=5).map(tuple)
+ISOCHRONOUS = st.builds(
+    Submit, NUMBERS, st.integers(0, 15), st.just(True), st.integers(0, 70_000), SETUPS, st.just(b""), PACKETS
+)
+REQUESTS = st.lists(TO_HOST | TO_DEVICE | ISOCHRONOUS | st.builds(Unlink, NUMBERS, NUMBERS), max_size=6)
 
 
 def wire(request: Submit | Unlink) -> bytes:
@@ -156,6 +161,17 @@ def test_transfers_of_an_endpoint_end_in_their_order():
             (usbip.RET_SUBMIT, 5, 0, b"ab"),
             (usbip.RET_SUBMIT, 3, 0, bytes(64)),
         ]
+
+
+def test_packets_of_an_isochronous_transfer_arrive_with_their_lengths():
+    with plugged() as host:
+        host.ask(Submit(1, 1, True, 300, bytes(8), b"", ((0, 100), (100, 100), (200, 100))), writing(2, b""))
+        host.answers(1)
+        contents = iter([b"abc", b"", b"x" * 200])
+        assert host.plug.deliver(1, lambda _: next(contents))
+        assert host.answers(1) == [(usbip.RET_SUBMIT, 1, 0, b"abc" + b"x" * 100)]
+        packets = struct.iter_unpack(">4i", host._read(48))
+        assert list(packets) == [(0, 100, 3, 0), (100, 100, 0, 0), (200, 100, 100, 0)]
 
 
 def test_a_cancelled_transfer_has_no_end_and_an_ended_one_cannot_be_cancelled():

@@ -4,10 +4,14 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Self
 
 DEVICE, CONFIGURATION, STRING, INTERFACE, ENDPOINT, QUALIFIER = 1, 2, 3, 4, 5, 6
-BULK, INTERRUPT = 2, 3
+ASSOCIATION, STORE, COMPANION = 11, 15, 0x30
+ISOCHRONOUS, BULK, INTERRUPT = 1, 2, 3
 ENGLISH = b"\x09\x04"
+_CAPABILITY = 0x10
+_FIRST_WITH_STORE = 0x0201
 
 
 class Speed(IntEnum):
@@ -16,11 +20,16 @@ class Speed(IntEnum):
     LOW = 1
     FULL = 2
     HIGH = 3
+    SUPER = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The identity of a device; ``kind`` is class, subclass and protocol."""
+    """The identity of a device; ``kind`` is class, subclass and protocol.
+
+    ``indices`` are those of the texts for manufacturer, name and serial number; ``functions`` those of the texts for
+    its interfaces, which are its name.
+    """
 
     vendor: int
     product: int
@@ -31,6 +40,23 @@ class Identity:
     usb: int = 0x200
     kind: tuple[int, int, int] = (0, 0, 0)
     packet_bytes: int = 64
+    indices: tuple[int, int, int] = (1, 2, 3)
+    functions: frozenset[int] = frozenset()
+
+    @classmethod
+    def read(cls, device: bytes, configuration: bytes, texts: tuple[str, str, str]) -> Self:
+        """Return the identity of a device from its descriptors; it has those of the texts that have an index there."""
+        usb, *kind, packet_bytes, vendor, product, release = struct.unpack_from("<H4B3H", device, 2)
+        indices = device[14], device[15], device[16]
+        manufacturer, name, serial = (text if index else "" for text, index in zip(texts, indices, strict=True))
+        named = {part[-1] for part in parts(configuration) if part[1] in (INTERFACE, ASSOCIATION)}
+        return cls(
+            *(vendor, product, release, manufacturer, name, serial, usb),
+            (kind[0], kind[1], kind[2]),
+            packet_bytes,
+            indices,
+            frozenset(named - {0}),
+        )
 
     @property
     def strings(self) -> tuple[str, ...]:
@@ -38,7 +64,7 @@ class Identity:
 
     def device(self) -> bytes:
         """Return the device descriptor."""
-        indices = (number if text else 0 for number, text in enumerate(self.strings, 1))
+        indices = (index if text else 0 for index, text in zip(self.indices, self.strings, strict=True))
         ids = (self.vendor, self.product, self.release)
         return struct.pack("<BBH4B3H4B", 18, DEVICE, self.usb, *self.kind, self.packet_bytes, *ids, *indices, 1)
 
@@ -50,10 +76,20 @@ class Identity:
         """Return a string descriptor; None if there is none."""
         if index == 0:
             return bytes([4, STRING]) + ENGLISH
-        if index > len(self.strings) or not self.strings[index - 1]:
+        texts = {**dict.fromkeys(self.functions, self.name), **dict(zip(self.indices, self.strings, strict=True))}
+        text = texts.get(index, "").encode("utf-16-le")
+        return bytes([2 + len(text), STRING]) + text if text else None
+
+    def store(self) -> bytes | None:
+        """Return the binary device object store, which newer devices have (USB 3.2, 9.6.2); None for an older one.
+
+        It says that the device is capable of SuperSpeed, too.
+        """
+        if self.usb < _FIRST_WITH_STORE:
             return None
-        text = self.strings[index - 1].encode("utf-16-le")
-        return bytes([2 + len(text), STRING]) + text
+        extension = struct.pack("<3BI", 7, _CAPABILITY, 2, 0)
+        super_speed = struct.pack("<4BHBBH", 10, _CAPABILITY, 3, 0, 0b1110, 1, 10, 0x7FF)
+        return struct.pack("<BBHB", 5, STORE, 5 + len(extension + super_speed), 2) + extension + super_speed
 
 
 def interface(number: int, kind: tuple[int, int, int], endpoints: int = 0, name: int = 0) -> bytes:
@@ -70,6 +106,27 @@ def configuration(body: Sequence[bytes], interfaces: int = 1, milliamps: int = 1
     """Return the configuration descriptor with its interfaces and endpoints."""
     rest = b"".join(body)
     return struct.pack("<BBHBBBBB", 9, CONFIGURATION, 9 + len(rest), interfaces, 1, 0, 0x80, milliamps // 2) + rest
+
+
+def at_super_speed(configuration: bytes) -> bytes:
+    """Return a configuration as a device has it at SuperSpeed: each endpoint has a companion (USB 3.2, 9.6.7).
+
+    The additional packets in a microframe of a fast isochronous endpoint become those of one interval.
+    """
+    body = []
+    for part in parts(configuration)[1:]:
+        if part[1] == COMPANION:
+            continue
+        body.append(part)
+        if part[1] == ENDPOINT:
+            size = int.from_bytes(part[4:6], "little")
+            more, isochronous = size >> 11 & 3, part[3] & 3 == ISOCHRONOUS
+            packet_bytes = 1024 if more or part[3] & 3 == BULK else size
+            body[-1] = part[:4] + packet_bytes.to_bytes(2, "little") + part[6:]
+            interval_bytes = 0 if part[3] & 3 == BULK else (size & 0x7FF) * (1 + more)
+            body.append(struct.pack("<4BH", 6, COMPANION, 0, more if isochronous else 0, interval_bytes))
+    rest = b"".join(body)
+    return configuration[:2] + (9 + len(rest)).to_bytes(2, "little") + configuration[4:9] + rest
 
 
 def parts(descriptors: bytes) -> list[bytes]:

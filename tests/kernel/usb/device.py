@@ -5,7 +5,7 @@ import struct
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import Thread
-from typing import ClassVar, Final
+from typing import Final
 
 from tests.kernel.usb import descriptors
 from tests.kernel.usb.descriptors import Identity, Speed
@@ -21,9 +21,9 @@ _FIXED: Final = {
     _GET_STATUS: b"\x00\x00",
     _GET_CONFIGURATION: b"\x01",
     _GET_INTERFACE: b"\x00",
-    **dict.fromkeys((_SET_CONFIGURATION, _SET_INTERFACE, _SET_FEATURE), b""),
+    **dict.fromkeys((_SET_CONFIGURATION, _SET_FEATURE), b""),
 }
-"""Answers that are always the same: each device has one configuration, and one setting of each interface."""
+"""Answers that are always the same: each device has one configuration, and Linux never asks for a setting."""
 _SETUP = struct.Struct("<BBHHH")
 
 
@@ -57,8 +57,8 @@ class UsbDevice:
         TCP port on this computer at which a host plugs the device in.
     """
 
-    identity: ClassVar[Identity]
-    speed: ClassVar[Speed] = Speed.HIGH
+    identity: Identity
+    speed: Speed = Speed.HIGH
     configuration: bytes
 
     def __init__(self) -> None:
@@ -116,6 +116,9 @@ class UsbDevice:
     def halt_cleared(self, endpoint: int) -> None:
         """Start an endpoint again."""
 
+    def interface_set(self, interface: int, setting: int) -> None:
+        """Change to an alternate setting of an interface."""
+
     # -- standard requests ------------------------------------------------------------------------------------------
 
     def control(self, setup: bytes, data: bytes) -> bytes:
@@ -128,6 +131,9 @@ class UsbDevice:
             return self.request(request) if answer is None else answer
         if request.number in _FIXED:
             return _FIXED[request.number]
+        if request.number == _SET_INTERFACE:
+            self.interface_set(request.index, request.value)
+            return b""
         if request.number == _CLEAR_FEATURE:
             if request.kind == TO_ENDPOINT and request.value == _ENDPOINT_HALT:
                 self.halt_cleared(request.index)
@@ -147,4 +153,6 @@ class UsbDevice:
                 return text
             case descriptors.QUALIFIER if self.speed is Speed.HIGH:
                 return self.identity.qualifier()
+            case descriptors.STORE:
+                return self.identity.store()
         return None

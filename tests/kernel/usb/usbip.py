@@ -1,6 +1,7 @@
 """USB/IP: the protocol between Linux's virtual USB host (``vhci-hcd``) and the device at the other end of a socket.
 
-Source: Documentation/usb/usbip_protocol.rst of the kernel, version 1.1.1; isochronous transfers are left out.
+Source: Documentation/usb/usbip_protocol.rst of the kernel, version 1.1.1; isochronous transfers to the device are left
+out.
 """
 
 import socket
@@ -22,6 +23,8 @@ _BASE = struct.Struct(">5I")  # command, sequence number, device, direction, end
 _SUBMIT = struct.Struct(">Iiiii8s")  # flags, length, start frame, number of packets, interval, setup
 _ANSWER = struct.Struct(">5Ii i i i i 8x")  # base; status, actual length, start frame, number of packets, errors
 _UNLINKED = struct.Struct(">5Ii24x")
+_PACKET = struct.Struct(">4i")  # offset, length, actual length, status
+MAX_PACKETS: Final = 1024
 _READ_BYTES: Final = 65_536
 
 
@@ -31,7 +34,11 @@ class NotUsbIp(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Submit:
-    """A transfer that the host asks for; ``data`` are the host's bytes, ``length`` how many it can receive."""
+    """A transfer that the host asks for; ``data`` are the host's bytes, ``length`` how many it can receive.
+
+    An isochronous transfer has ``packets``: where the bytes of each are in the host's buffer, and how many it can
+    receive.
+    """
 
     number: int
     endpoint: int
@@ -39,6 +46,7 @@ class Submit:
     length: int
     setup: bytes
     data: bytes = b""
+    packets: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,20 +74,24 @@ class Receiver:
                 yield Unlink(number, victim)
                 continue
             _, length, _, packets, _, setup = _SUBMIT.unpack_from(self._bytes, _BASE.size)
-            if command != CMD_SUBMIT or direction > 1 or endpoint > 15 or not 0 <= length <= MAX_LENGTH or packets > 0:
+            count = max(packets, 0)  # some kernels say -1 for none
+            valid = direction <= 1 and endpoint <= 15 and 0 <= length <= MAX_LENGTH and count <= direction * MAX_PACKETS
+            if command != CMD_SUBMIT or not valid:
                 raise NotUsbIp(f"command {command}, endpoint {endpoint}, length {length}, packets {packets}")
-            end = HEADER if direction else HEADER + length
+            end = HEADER + _PACKET.size * count if direction else HEADER + length
             if len(self._bytes) < end:
                 return
             payload = bytes(self._bytes[HEADER:end])
             del self._bytes[:end]
-            yield Submit(number, endpoint, bool(direction), length, setup, payload)
+            parts = tuple((offset, size) for offset, size, _, _ in _PACKET.iter_unpack(payload)) if count else ()
+            yield Submit(number, endpoint, bool(direction), length, setup, b"" if direction else payload, parts)
 
 
 def submit(request: Submit) -> bytes:
     """Return a request as the host sends it."""
     base = _BASE.pack(CMD_SUBMIT, request.number, 1, request.reading, request.endpoint)
-    return base + _SUBMIT.pack(0, request.length, 0, 0, 0, request.setup) + request.data
+    packets = b"".join(_PACKET.pack(*packet, 0, 0) for packet in request.packets)
+    return base + _SUBMIT.pack(0, request.length, 0, len(request.packets), 0, request.setup) + request.data + packets
 
 
 def unlink(request: Unlink) -> bytes:
@@ -92,6 +104,15 @@ def answer(number: int, status: int, data: bytes = b"", received: int | None = N
     return (
         _ANSWER.pack(RET_SUBMIT, number, 0, 0, 0, status, len(data) if received is None else received, 0, 0, 0) + data
     )
+
+
+def answer_packets(request: Submit, contents: list[bytes]) -> bytes:
+    """Return the end of an isochronous transfer with the bytes of its packets, which are not padded."""
+    data = b"".join(contents)
+    parts = zip(request.packets, contents, strict=True)
+    packets = b"".join(_PACKET.pack(*packet, len(content), 0) for packet, content in parts)
+    head = _ANSWER.pack(RET_SUBMIT, request.number, 0, 0, 0, 0, len(data), 0, len(contents), 0)
+    return head + data + packets
 
 
 class Stall(Exception):
@@ -146,13 +167,19 @@ class Plug:
         return len(self._waiting.get(endpoint, ()))
 
     def deliver(self, endpoint: int, produce: Callable[[int], bytes]) -> bool:
-        """End the oldest transfer from an endpoint with the bytes of ``produce(length)``; False: there is none."""
+        """End the oldest transfer from an endpoint with the bytes of ``produce(length)``; False: there is none.
+
+        For an isochronous transfer it is called for each packet.
+        """
         with self._lock:
             queue = self._waiting.get(endpoint)
             if not queue:
                 return False
             request = queue.popleft()
-            self._send(answer(request.number, 0, produce(request.length)[: request.length]))
+            if request.packets:
+                self._send(answer_packets(request, [produce(length)[:length] for _, length in request.packets]))
+            else:
+                self._send(answer(request.number, 0, produce(request.length)[: request.length]))
             return True
 
     def _serve(self, request: Submit | Unlink) -> None:

@@ -17,55 +17,35 @@ from rig.devices.v4l2 import CAPTURE, VideoMode, choose_mode
 from rig.doctor.device_scan import FoundCamera, camera_settings
 from rig.doctor.finding import FindingCode, finding_words
 from sim.world import World
+from tests.kernel.usb.video import Video
 from tests.rig.devices.test_v4l2 import driver
 from tests.rig.doctor.doctor_parts import unopened
-from tests.webcams import WEBCAMS, ModelledWebcam, WebcamModel
+from tests.webcams import WEBCAMS, ModelledWebcam, WebcamModel, recorded
 
 META = 0x0080_0000
-RECORDINGS = Path(__file__).parents[4] / "shared" / "data" / "recordings" / "webcams"
-V4L2_NAMES = {"YUY2": "YUYV", "H265": "HEVC"}
 
 
 def described(device: bytes, configuration: bytes) -> WebcamModel:
-    """Return what the descriptors of a device say (USB Video Class 1.1, 3.7 and 3.9; frame-based payload 1.1, 3.1)."""
+    """Return what the descriptors of a device say."""
     usb, ids, strings = device[2:4], device[8:12], zip("mps", device[14:17], strict=True)
-    camera = processing = 0
+    video = Video.described(configuration)
     formats: dict[str, list[str]] = {}
-    kind, fourcc, at = (0, 0), "", 0
-    while at < len(configuration):
-        part = configuration[at : at + configuration[at]]
-        at += configuration[at]
-        match part[1], kind, part[2]:
-            case 4, _, _:  # an interface: class and subclass
-                kind = part[5], part[6]
-            case 0x24, (14, 1), 2 if part[4:6] == b"\x01\x02":  # a camera
-                camera = int.from_bytes(part[15 : 15 + part[14]], "little")
-            case 0x24, (14, 1), 5:
-                processing = int.from_bytes(part[8 : 8 + part[7]], "little")
-            case 0x24, (14, 2), 4 | 0x10:  # uncompressed, and frame-based
-                fourcc = V4L2_NAMES.get(part[5:9].decode(), part[5:9].decode())
-            case 0x24, (14, 2), 6:
-                fourcc = "MJPG"
-            case 0x24, (14, 2), 5 | 7 | 0x11 as frame:
-                size, (count, times) = struct.unpack_from("<2H", part, 5), (21, 26) if frame == 0x11 else (25, 26)
-                shortest = min(struct.unpack_from(f"<{part[count]}I", part, times))
-                formats.setdefault(fourcc, []).append(f"{size[0]}x{size[1]}@{round(1e7 / shortest, 2):g}")
+    for mode in (mode for stream in video.streams.values() for mode in stream.modes.values()):
+        fps = round(1e7 / mode.shortest, 2)
+        formats.setdefault(mode.fourcc, []).append(f"{mode.width}x{mode.height}@{fps:g}")
     return WebcamModel(
         *struct.unpack("<H", usb),
         *struct.unpack("<2H", ids),
         "".join(letter for letter, index in strings if index),
-        camera,
-        processing,
+        video.camera[1],
+        video.processing[1],
         {name: " ".join(sizes) for name, sizes in formats.items()},
     )
 
 
 @pytest.mark.parametrize("name", WEBCAMS)
 def test_table_is_that_of_the_descriptors(name: str) -> None:
-    if not RECORDINGS.is_dir():
-        pytest.skip(f"no recordings in {RECORDINGS}")
-    files = [(RECORDINGS / f"{name}.{part}_desc.bin").read_bytes() for part in ("dev", "cfg")]
-    assert described(*files) == WEBCAMS[name]
+    assert described(*recorded(name)) == WEBCAMS[name]
 
 
 class Sizes(dict[tuple[int, int], list[tuple[int, int]]]):
