@@ -39,6 +39,7 @@ class ComputerFiles:
     def link(self, path: str, target: Path) -> None:
         file = self.root / path.lstrip("/")
         file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)  # of two devices with one name, udev's link leads to the last one
         file.symlink_to(target)
 
     def group(self, name: str, gid: int, *members: str) -> None:

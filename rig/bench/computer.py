@@ -13,7 +13,7 @@ import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,9 +196,27 @@ class Computer:
         return (hertz or _USUAL_I2C_HZ) / 1000
 
     def cameras(self) -> list[DeviceFile]:
-        """Return the device files that deliver images: no converters, no metadata, no second file of one camera."""
-        nodes = self._nodes(_CAMERAS, "dev/v4l/by-id")
-        return [n for n in nodes if self._is_camera(n)]
+        """Return the device files that deliver images: no converters, no metadata, no second file of one camera.
+
+        Cameras that the texts of their maker do not distinguish have one name in by-id, which leads to any of them: the
+        stable name of each is its place.
+        """
+        nodes = [n for n in self._nodes(_CAMERAS, "dev/v4l/by-id") if self._is_camera(n)]
+        described = {n.path: self._usb(self.root / _CAMERAS / Path(n.path).name / "device") for n in nodes}
+        texts = {
+            path: (
+                usb.get("manufacturer", usb["idVendor"]),
+                usb.get("product", usb.get("idProduct")),
+                usb.get("serial"),
+            )
+            for path, usb in described.items()
+            if usb
+        }
+        repeated = {path for path, text in texts.items() if list(texts.values()).count(text) > 1}
+        return [
+            replace(n, stable=self._link("dev/v4l/by-path", self._at(n.path).resolve())) if n.path in repeated else n
+            for n in nodes
+        ]
 
     def ribbon_cameras(self) -> list[str]:
         """Return the sensors on ribbon cables of a Raspberry Pi, for example imx708; libcamera develops the images."""

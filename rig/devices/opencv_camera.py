@@ -215,7 +215,9 @@ class OpenCvCamera:
             if prop == cv2.CAP_PROP_GAIN:
                 value = max(value, smallest)
             asked.append((name, prop, value, max(step / 2, 0 if name == "fourcc" else 0.01 * abs(value))))
-            if self._capture.set(prop, value):
+            convertible = name != "fourcc" or _value_text(name, value) in v4l2.UNCOMPRESSED + v4l2.COMPRESSED
+            # In another format, such as H.264, the camera would send frames that OpenCV cannot decode.
+            if convertible and self._capture.set(prop, value):
                 self._supported.add(prop)
 
         if (fourcc := self._pixel_format(settings)) is not None:  # before the size: it selects the sizes

@@ -96,16 +96,14 @@ class GuestBench:
     def plug_in(self, *devices: UsbDevice) -> None:
         """Plug devices in, and wait until their device files exist."""
         for device in devices:
-            number = self.played.usb.index(device)
-            self.machine.ask("attach", port=device.port, hub_port=number, device=number + 1, speed=int(device.speed))
+            self._attach(device, self.played.usb.index(device))
         for device in devices:
             self.until(lambda device=device: self._exists(device), f"{type(device).__name__} appears")
         self.sh("udevadm settle --timeout=30")
 
     def plug_in_adapter(self, adapter: UsbDevice, driver: str) -> str:
         """Plug in another I2C adapter, and return its device file."""
-        number = len(self.played.usb)
-        self.machine.ask("attach", port=adapter.port, hub_port=number, device=number + 1, speed=int(adapter.speed))
+        self._attach(adapter, len(self.played.usb))
 
         def buses() -> list[str]:
             names = self.files("/sys/class/i2c-dev/*/name").items()
@@ -114,6 +112,23 @@ class GuestBench:
         self.until(buses, f"{driver} appears")
         self.sh("udevadm settle --timeout=30")
         return f"/dev/{buses()[0]}"
+
+    def plug_in_webcam(self, webcam: UsbDevice, number: int) -> str:
+        """Plug in another webcam, and return its device file; ``number`` counts such webcams."""
+        hub_port = len(self.played.usb) + number
+        self._attach(webcam, hub_port)
+        indices = f"/sys/devices/platform/vhci_hcd.0/usb*/*-{hub_port + 1}/*/video4linux/video*/index"
+
+        def nodes() -> list[str]:
+            return [PurePosixPath(file).parent.name for file, text in self.files(indices).items() if text == "0\n"]
+
+        self.until(nodes, "the webcam appears")
+        self.sh("udevadm settle --timeout=60")
+        return f"/dev/{nodes()[0]}"
+
+    def _attach(self, device: UsbDevice, hub_port: int) -> None:
+        speed = int(device.speed)
+        self.machine.ask("attach", port=device.port, hub_port=hub_port, device=hub_port + 1, speed=speed)
 
     def unplug(self, *devices: UsbDevice) -> None:
         """Pull the cables of devices, and wait until the kernel has noticed."""

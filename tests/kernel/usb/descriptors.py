@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Self
 
@@ -57,6 +57,10 @@ class Identity:
             indices,
             frozenset(named - {0}),
         )
+
+    def at_super_speed(self) -> Self:
+        """Return the identity that the device has at SuperSpeed: its endpoint 0 takes 2⁹ bytes."""
+        return replace(self, usb=0x0300, packet_bytes=9)
 
     @property
     def strings(self) -> tuple[str, ...]:

@@ -131,6 +131,26 @@ def test_doctor_names_what_a_camera_lacks_with_the_setting_that_accepts_it(world
         assert "(HEVC); nearest: 640x480 at 30 frames/s (YUYV)" in finding_words(problem)
 
 
+class Decodes(ModelledWebcam):
+    """It can be set to any format, as with ``uvcvideo``."""
+
+    asked: int | None = None
+
+    def set(self, prop: int, value: float) -> bool:
+        if prop == cv2.CAP_PROP_FOURCC:
+            self.asked = int(value)
+            return True
+        return super().set(prop, value)
+
+
+@pytest.mark.parametrize("fourcc", ["HEVC", "H264"])
+def test_a_format_that_opencv_does_not_convert_is_rejected_without_asking_for_it(world: World, fourcc: str) -> None:
+    capture = Decodes(world, WEBCAMS["elp_h265"])
+    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraConfig(fourcc=fourcc))
+    assert [(one.setting, one.asked) for one in camera.rejected_settings] == [("fourcc", fourcc)]
+    assert capture.asked is None
+
+
 def test_cameras_without_names_and_with_one_id_are_distinguished() -> None:
     with unopened(plugged=False) as bench:
         files, computer = bench.computer, bench.context.computer
@@ -151,3 +171,17 @@ def test_cameras_without_names_and_with_one_id_are_distinguished() -> None:
         assert devices[1] == "USB 0c45:6340 (canyon_cne_cwc2) at usb-1-1-video-index0"
         assert devices[4] == "USB 046d:0825, serial number SN0001"
         assert devices[6] == "USB 0c45:6340 (trust_webcam), serial number SN0001"
+
+
+def test_cameras_with_the_same_texts_are_known_by_their_place() -> None:
+    """Their makers give many webcams one name and one serial number."""
+    with unopened(plugged=False) as bench:
+        for number in range(2):
+            usb = ("32e4", "9422", "HD USB Camera")
+            bench.computer.camera(number, "HD USB Camera", serial="01.00.00", usb_port=f"1-{number}", usb=usb)
+        bench.computer.camera(2, "HD Webcam", serial="01.00.00", usb_port="1-2", usb=("046d", "0825", "HD Webcam"))
+        assert [camera.stable for camera in bench.context.computer.cameras()] == [
+            "/dev/v4l/by-path/usb-1-0-video-index0",
+            "/dev/v4l/by-path/usb-1-1-video-index0",
+            "/dev/v4l/by-id/usb-HD_Webcam-video-index0",
+        ]
