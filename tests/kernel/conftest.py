@@ -8,7 +8,7 @@ import pytest
 
 from rig.doctor.computer import RULES_FILES
 from tests.kernel.guest_bench import GuestBench
-from tests.kernel.machine import Machine, NotReady, Result, kernel_folder
+from tests.kernel.machine import Machine, NotReady, Result, find_kernel
 from tests.kernel.played_bench import PlayedBench
 
 BRLTTY_RULE = '''SUBSYSTEM=="usb", ENV{PRODUCT}=="403/6014/*", ENV{SYSTEMD_WANTS}+="brltty-device@.service"'''
@@ -32,7 +32,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     if "PYTEST_XDIST_WORKER" in os.environ:
         pytest.skip("the kernel tests share one virtual machine: run `make kernel-test`")
     try:
-        kernel = kernel_folder()
+        kernel = find_kernel()
     except NotReady as missing:
         pytest.skip(str(missing))
     with Machine(kernel, tmp_path_factory.mktemp("machine")) as machine:

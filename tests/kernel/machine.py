@@ -1,4 +1,4 @@
-"""A virtual machine with Debian's own kernel, on an overlay of this computer's files."""
+"""A virtual machine with Debian's own kernel, on an overlay of this computer's files or of those of another one."""
 
 import gzip
 import json
@@ -19,16 +19,21 @@ from typing import Any, Final, Self
 from rig.core.clock import SystemClock
 
 KERNEL: Final = "RIG_TEST_KERNEL"
-"""The variable that names the kernel: a package (.deb), or a folder with ``boot`` and ``lib/modules``."""
+"""The variable that names the kernel: a package (.deb), or a folder with ``boot`` and ``lib/modules``.
+
+A folder with Python, too, has all files of the machine, for example those of an arm64 computer (``guest/arm64.sh``).
+"""
 ACCELERATOR: Final = "RIG_TEST_ACCELERATOR"
 """The variable that chooses QEMU's accelerator, for example ``kvm``; default: emulation, which works everywhere."""
-PACKAGES: Final = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "modprobe": "kmod"}
+PACKAGES: Final = {"busybox": "busybox-static", "modprobe": "kmod"}
 """Programs, and the Debian packages that have them."""
 MODULES: Final = ("virtio_pci", "9pnet_virtio", "9p", "overlay")
 """What the kernel needs to find its files."""
 BOOT_S: Final = 300.0
 BOOTS: Final = 3
 """Attempts to start the kernel, whose measurement of its timer fails while other programs use the processor."""
+SILENT_S: Final = 120.0
+"""If the machine has printed nothing in this time, its kernel hangs."""
 ANSWER_S: Final = 300.0
 PROJECT: Final = Path(__file__).parents[2]
 _INIT = """#!/bin/busybox sh
@@ -42,17 +47,66 @@ $busybox mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000,cache=loose,r
 $busybox mount -t tmpfs -o size=1g,mode=0755 upper /upper
 $busybox mkdir -p /upper/files /upper/work
 $busybox mount -t overlay -o lowerdir=/lower,upperdir=/upper/files,workdir=/upper/work overlay /newroot
+if [ ! -d /newroot{project} ]; then  # the files of another computer
+    $busybox mkdir -p /newroot{project}
+    $busybox mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000,cache=loose,ro project /newroot{project}
+fi
 for folder in proc sys dev; do $busybox mount --move /$folder /newroot/$folder; done
-exec $busybox switch_root /newroot /bin/bash {init}
+exec $busybox switch_root /newroot /bin/bash {project}/tests/kernel/guest/init.sh
 """
+
+
+@dataclass(frozen=True, slots=True)
+class Architecture:
+    """How QEMU emulates a computer: its program, the package of it, its options, and the kernel's own options."""
+
+    qemu: str
+    package: str
+    machine: tuple[str, ...]
+    line: str
+
+
+X86_64: Final = Architecture(
+    "qemu-system-x86_64",
+    "qemu-system-x86",
+    ("-machine", "q35", "-cpu", "max"),
+    "console=ttyS0 mitigations=off nokaslr tsc=reliable",
+)
+ARM64: Final = Architecture(
+    "qemu-system-aarch64",
+    "qemu-system-arm",
+    ("-machine", "virt", "-cpu", "cortex-a76"),  # the processor of a Raspberry Pi 5
+    "console=ttyAMA0 mitigations=off nokaslr",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """A kernel: its folder, and the folder of the files that the machine sees."""
+
+    folder: Path
+    files: Path = Path("/")
+
+    @property
+    def release(self) -> str:
+        return next((self.folder / "lib/modules").iterdir()).name
+
+    @property
+    def architecture(self) -> Architecture:
+        return ARM64 if self.release.endswith("-arm64") else X86_64
+
+    @property
+    def python(self) -> Path:
+        """Python in the machine."""
+        return Path(sys.executable) if self.files == Path("/") else Path("/usr/bin/python3")
 
 
 class NotReady(Exception):
     """This computer cannot run the virtual machine; the text says what is missing and how to get it."""
 
 
-def kernel_folder() -> Path:
-    """Return the folder of the kernel, after unpacking its package beside it.
+def find_kernel() -> Kernel:
+    """Return the kernel, after unpacking its package beside it.
 
     Raises
     ------
@@ -61,15 +115,17 @@ def kernel_folder() -> Path:
     """
     if platform.machine() != "x86_64":
         raise NotReady(f"the kernel tests need an x86-64 computer, not {platform.machine()}")
-    if missing := [package for program, package in PACKAGES.items() if _found(program) is None]:
-        raise NotReady(f"packages are missing: sudo apt-get install --no-install-recommends {' '.join(missing)} udev")
     path = Path(os.environ.get(KERNEL, ""))
     packages = [path] if path.suffix == ".deb" else sorted(path.glob("linux-image-*.deb")) if path.name else []
     if packages and packages[-1].is_file():
         path = _unpacked(packages[-1])
     if not path.name or not list(path.glob("boot/vmlinuz-*")):
         raise NotReady(f"{KERNEL}={path} names no kernel: `make kernel-test` says how to get one")
-    return path
+    kernel = Kernel(path, path if (path / "usr/bin/python3").exists() else Path("/"))
+    programs = {kernel.architecture.qemu: kernel.architecture.package, **PACKAGES}
+    if missing := [package for program, package in programs.items() if _found(program) is None]:
+        raise NotReady(f"packages are missing: sudo apt-get install --no-install-recommends {' '.join(missing)} udev")
+    return kernel
 
 
 def _found(program: str) -> str | None:
@@ -88,15 +144,16 @@ def _unpacked(package: Path) -> Path:
     return folder
 
 
-def initial_files(kernel: Path, release: str) -> bytes:
+def initial_files(kernel: Kernel) -> bytes:
     """Return the kernel's initial file system: busybox, the modules that find the files, and what starts them."""
-    init = Path(__file__).parent / "guest/init.sh"
     files: list[tuple[str, int, bytes]] = [(name, 0o40755, b"") for name in ("bin", "modules")]
-    files.append(("init", 0o100755, _INIT.format(init=init).encode()))
-    files.append(("bin/busybox", 0o100755, Path(_found("busybox") or "").read_bytes()))
+    files.append(("init", 0o100755, _INIT.format(project=PROJECT).encode()))
+    busybox = Path(_found("busybox") or "") if kernel.files == Path("/") else kernel.files / "usr/bin/busybox"
+    files.append(("bin/busybox", 0o100755, busybox.read_bytes()))
     modules: list[str] = []
     for module in MODULES:
-        command = [_found("modprobe") or "modprobe", "-d", str(kernel), "-S", release, "--show-depends", module]
+        command = [_found("modprobe") or "modprobe", "-d", str(kernel.folder), "-S", kernel.release]
+        command += ["--show-depends", module]
         listed = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
         modules += [line.split()[1] for line in listed if line.startswith("insmod")]
     for number, path in enumerate(dict.fromkeys(modules)):
@@ -125,26 +182,31 @@ class Result:
 class Machine:
     """A running virtual machine, whose agent carries out requests."""
 
-    def __init__(self, kernel: Path, folder: Path) -> None:
-        release = next((kernel / "lib/modules").iterdir()).name
+    def __init__(self, kernel: Kernel, folder: Path) -> None:
+        self.kernel = kernel
+        architecture, release = kernel.architecture, kernel.release
         image = folder / "initrd.gz"
-        image.write_bytes(initial_files(kernel, release))
+        image.write_bytes(initial_files(kernel))
         self.log = folder / "console.log"
         self._numbers = count(1)
         self._answers: dict[int, dict[str, Any]] = {}
         self._changed = Condition()
         with socket.create_server(("127.0.0.1", 0)) as listener:
             words = {
-                "modules": kernel / "lib/modules" / release,
-                "python": sys.executable,
+                "modules": kernel.folder / "lib/modules" / release,
+                "python": kernel.python,
                 "project": PROJECT,
                 "port": listener.getsockname()[1],
             }
-            line = "console=ttyS0 quiet panic=-1 mitigations=off net.ifnames=0 nokaslr tsc=reliable"
+            line = f"{architecture.line} quiet panic=-1 net.ifnames=0"
             line += "".join(f" rig.{name}={value}" for name, value in words.items())
             command = [
+                architecture.qemu,
+                *architecture.machine,
                 *_QEMU,
-                *("-kernel", kernel / f"boot/vmlinuz-{release}", "-initrd", image, "-append", line),
+                *_shared("host", kernel.files),
+                *_shared("project", PROJECT),
+                *("-kernel", kernel.folder / f"boot/vmlinuz-{release}", "-initrd", image, "-append", line),
                 *("-serial", f"file:{self.log}"),
             ]
             listener.settimeout(1.0)
@@ -159,7 +221,7 @@ class Machine:
         self._reader.start()
 
     def _agent(self, listener: socket.socket, *, last: bool) -> socket.socket | None:
-        """Wait until the machine has started; None if its kernel has stopped at once, and this was not the last try."""
+        """Wait until the machine runs; None if its kernel has stopped or hangs, and this was not the last try."""
         clock = SystemClock()
         begun_ns = clock.now_ns()
         while self._process.poll() is None and clock.now_ns() - begun_ns < BOOT_S * 1e9:
@@ -168,12 +230,19 @@ class Machine:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 connection.settimeout(None)
                 return connection
-        if self._process.poll() is not None and not last:
+            if not last and clock.now_ns() - begun_ns > SILENT_S * 1e9 and not self._printed:
+                break
+        if not last and (self._process.poll() is not None or not self._printed):
+            self._process.kill()
+            self._process.wait()
             return None
-        console = self.log.read_text(errors="replace") if self.log.exists() else ""
         self._process.kill()
         self._process.wait()
-        raise RuntimeError(f"the virtual machine did not start:\n{console[-4000:]}")
+        raise RuntimeError(f"the virtual machine did not start:\n{self._printed[-4000:]}")
+
+    @property
+    def _printed(self) -> str:
+        return self.log.read_text(errors="replace") if self.log.exists() else ""
 
     def __enter__(self) -> Self:
         return self
@@ -236,10 +305,14 @@ class GuestProcess:
 
 
 _QEMU: Final[list[str | Path]] = [
-    *("qemu-system-x86_64", "-machine", "q35", "-cpu", "max", "-smp", "2", "-m", "3G"),
+    *("-smp", "2", "-m", "3G"),
     *("-accel", os.environ.get(ACCELERATOR, "tcg,thread=multi")),
     *("-nodefaults", "-display", "none", "-no-reboot"),
-    *("-fsdev", "local,id=host,path=/,security_model=none,readonly=on,multidevs=remap"),
-    *("-device", "virtio-9p-pci,fsdev=host,mount_tag=host"),
     *("-netdev", "user,id=net", "-device", "virtio-net-pci,netdev=net"),
 ]
+
+
+def _shared(name: str, folder: Path) -> list[str]:
+    """Return the options that show a folder to the machine, which cannot write to it."""
+    files = f"local,id={name},path={folder},security_model=none,readonly=on,multidevs=remap"
+    return ["-fsdev", files, "-device", f"virtio-9p-pci,fsdev={name},mount_tag={name}"]

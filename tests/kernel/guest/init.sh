@@ -11,7 +11,7 @@ mkdir -p /run/udev /run/lock /dev/pts /dev/shm
 mount -t devpts devpts /dev/pts
 mount -t tmpfs shm /dev/shm
 mkdir -p /lib/modules
-ln -sfn "$modules" "/lib/modules/$release"
+[ -e "/lib/modules/$release" ] || ln -sfn "$modules" "/lib/modules/$release"
 start_devices_and_network() {
     echo "udev $(cut -d" " -f1 /proc/uptime)"; busybox hostname kernel-test
     busybox ifconfig lo 127.0.0.1 up
