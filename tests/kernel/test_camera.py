@@ -45,7 +45,7 @@ def test_doctor_finds_a_camera_that_repeats_one_image_and_not_its_delay(bench: G
         bench.played.devices.camera.latency_ns = DELAY_NS
     found = findings(bench)
     assert found["camera_frozen"]["evidence"]["frame_age_ms"] < DELAY_NS * 1e-6
-    assert "calibrate camera-time" in found["camera_delay_unknown"]["finding"]
+    assert "calibrate camera-time" in found["camera_delay_unknown"]["fix"]
 
 
 def test_a_camera_that_hangs_is_reported(bench: GuestBench) -> None:

@@ -130,7 +130,8 @@ def at_super_speed(configuration: bytes) -> bytes:
             interval_bytes = 0 if part[3] & 3 == BULK else (size & 0x7FF) * (1 + more)
             body.append(struct.pack("<4BH", 6, COMPANION, 0, more if isochronous else 0, interval_bytes))
     rest = b"".join(body)
-    return configuration[:2] + (9 + len(rest)).to_bytes(2, "little") + configuration[4:9] + rest
+    power = configuration[8] // 4  # in 8 mA instead of 2 mA
+    return configuration[:2] + (9 + len(rest)).to_bytes(2, "little") + configuration[4:8] + bytes([power]) + rest
 
 
 def parts(descriptors: bytes) -> list[bytes]:
