@@ -78,7 +78,11 @@ class Trace:
     is_cut: bool
 
     def of(self, device: Device) -> list[TraceEvent]:
-        return [event for event in self.events if event.on == device]
+        """Return the events of a device; of a trace that was cut, without a last request whose answer is missing."""
+        events = [event for event in self.events if event.on == device]
+        while self.is_cut and events and (events[-1].write is not None or (device == "servo" and not events[-1].reply)):
+            events.pop()
+        return events
 
     def notes(self, device: Device) -> dict[str, Any]:
         """Return all notes about a device."""
@@ -106,9 +110,6 @@ def read_trace(path: Path) -> Trace:
             ) from error
         kind = TraceEvent
     header, *events = parsed
-    # The answer to the last request is missing in a trace that was cut: a replay would find one too many.
-    while rest and events and (events[-1].write is not None or (events[-1].on == "servo" and not events[-1].reply)):
-        events.pop()
     config = validate(RigConfig, _without_places(header.config), where=str(path))
     # The thread that feeds a rig head may write a line a little late.
     return Trace(header, config, tuple(sorted(events, key=lambda event: event.t_ns)), is_cut=bool(rest))
