@@ -18,7 +18,8 @@ def rotating(bench: GuestBench, *settings: object) -> GuestProcess:
     away = 0 if bench.played.table()[0] > 200 else 390
     goto = bench.start("goto", away, *SLOW, *settings)
     try:
-        bench.until(lambda: abs(bench.played.table()[1]) > 5, "the table rotates", 120)
+        bench.until(lambda: abs(bench.played.table()[1]) > 5 or not goto.runs, "the table rotates", 120)
+        assert goto.runs, "the program has ended"
     except AssertionError as late:
         raise AssertionError(f"{late}; the program has printed:\n{goto.output}") from None
     return goto
