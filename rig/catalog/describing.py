@@ -95,7 +95,7 @@ def described(
                 levels, _evidence(stored[SEGMENTATION], count) if SEGMENTATION in needed else ({},) * count
             )
     with database.catalog_errors():
-        found = _describe(_reader(database.images, held), enrollment, name, kinds, threads=THREADS)
+        found = _describe(reader(database.images.pixels, held), enrollment, name, kinds, threads=THREADS)
     store(database, seal, _contents(enrollment, found))
     return found
 
@@ -103,7 +103,7 @@ def described(
 # Compute
 
 
-def _reader(images: Images, held: Mapping[str, Pixels] | None = None) -> Callable[[str], Pixels]:
+def reader(read: Callable[[str], Pixels], held: Mapping[str, Pixels] | None = None) -> Callable[[str], Pixels]:
     """Return a function that reads each image once: it holds pixels, ``held`` ones first, up to `MOST_HELD_BYTES`.
 
     Decoding takes longer than describing, and a view is used several times.
@@ -113,12 +113,22 @@ def _reader(images: Images, held: Mapping[str, Pixels] | None = None) -> Callabl
     def pixels(image: str) -> Pixels:
         if image in known:
             return known[image]
-        found = images.pixels(image)
+        found = read(image)
         if sum(one.nbytes for one in known.values()) + found.nbytes <= MOST_HELD_BYTES:
             known[image] = found
         return found
 
     return pixels
+
+
+def computed(
+    pixels: Callable[[str], Pixels], enrollment: Enrollment, name: str, kinds: tuple[str, ...]
+) -> dict[str, bytes]:
+    """Return the contents of the description of an object's enrollment, by kind; ``pixels`` reads an image.
+
+    Raises `CatalogError`: a view cannot be described. Its evidence has the view's place and the reason.
+    """
+    return _contents(enrollment, _describe(pixels, enrollment, name, kinds))
 
 
 def describe_one(images: Images, kinds: tuple[str, ...], one: tuple[str, Enrollment]) -> dict[str, bytes] | str:
@@ -128,7 +138,7 @@ def describe_one(images: Images, kinds: tuple[str, ...], one: tuple[str, Enrollm
     """
     name, enrollment = one
     try:
-        return _contents(enrollment, _describe(_reader(images), enrollment, name, kinds))
+        return computed(reader(images.pixels), enrollment, name, kinds)
     except (CatalogError, UsageError) as error:
         return error.what.rstrip(".")
 
@@ -200,6 +210,7 @@ def _reasons(name: str, place: int) -> Iterator[None]:
         raise CatalogError(
             f"View {place} of {name!r} cannot be described: {reason}.",
             next_step=("Check the disk.", Do.VERIFY_CATALOG()),
+            evidence={"view": place, "reason": reason},
         ) from error
 
 

@@ -7,7 +7,7 @@ Decision: docs/decisions/0011.
 """
 
 import secrets
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
@@ -160,6 +160,7 @@ def transfer(
     *,
     conflict: Conflict = Conflict.REJECT,
     label: str | None = None,
+    descriptors: Sequence[str] = (),
     jobs: int | None = None,
     dry_run: bool = False,
     once: bool = False,
@@ -174,6 +175,8 @@ def transfer(
     ----------
     label
         Label of new objects that have none.
+    descriptors
+        Descriptors to be computed at once, unless the source is this bench's own; others when they are needed.
     jobs
         Number of processes; None for one process per core.
     dry_run
@@ -196,18 +199,19 @@ def transfer(
     plan = _Plan(tuple(source.items()))
     with target.database.read() as transaction:
         plan = plan.compared(transaction, conflict, once=once)
-    enrollments = [item.enrollment for item in plan.wanted]
+    enrollments = {item.name: item.enrollment for item in plan.wanted}
     reading = Reading(
         source.content,
         store if is_own or not strict else None,
         is_named=catalog is not None,
         decodes=not is_own,
+        descriptors=tuple(descriptors),
     )
     with target.database.catalog_errors():
         found = yield from read_images(reading, enrollments, strict=strict and not dry_run, jobs=jobs)
     rejected = (*source.rejected, *found.rejected.values())
     plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=catalog is None))
-    tables = {session.empty_table for one in enrollments for session in one.sessions}
+    tables = {session.empty_table for one in enrollments.values() for session in one.sessions}
     if (strict and rejected) or (found.rejected and not plan.wanted) or not tables.isdisjoint(found.rejected):
         raise _rejection(source, rejected)
 
@@ -233,8 +237,14 @@ def transfer(
                 log.append(
                     transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)}
                 )
+                rows = [
+                    describing.row_of(seal_of(enrollment), what, content)
+                    for name, enrollment in new.items()
+                    for what, content in found.contents.get(name, {}).items()
+                ]
                 if once and catalog is not None:
-                    describing.add(transaction, _computed(catalog.catalog, new))
+                    rows += _computed(catalog.catalog, new.values())
+                describing.add(transaction, rows)
     counts = (len(plan.wanted), plan.views, plan.bytes)
     return Transferred(*counts, plan.skipped, plan.replaced, rejected)
 
@@ -380,9 +390,9 @@ def _ids(transaction: Transaction, names: Sequence[str]) -> dict[str, int]:
 # Add
 
 
-def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | None) -> list[Enrollment]:
-    """Add the rows of objects, and a line of the log for each enrollment; return the new ones."""
-    new = []
+def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
+    """Add the rows of objects, and a line of the log for each enrollment; return the new ones by name."""
+    new = {}
     for item in plan.wanted:
         known = state.state_of(transaction, item.name)
         object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
@@ -397,7 +407,7 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
         else:
             if there is not None:  # with other views, or of an object that is deleted or has another name
                 _digest(enrollment, secrets.token_hex(32))
-            new.append(_store(transaction, enrollment, object_id))
+            new[item.name] = _store(transaction, enrollment, object_id)
         if known is not None:
             state.end_current(transaction, target.clock, known, EnrollmentStatus.COMPLETE)
         columns = state.ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
@@ -422,7 +432,7 @@ def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> 
     return enrollment
 
 
-def _computed(source: Catalog, new: Sequence[Enrollment]) -> list[dict[str, Any]]:
+def _computed(source: Catalog, new: Iterable[Enrollment]) -> list[dict[str, Any]]:
     """Return the rows of what the catalog ``source`` has computed from these enrollments."""
     rows: list[dict[str, Any]] = []
     with source.database.read() as reading:

@@ -23,7 +23,7 @@ from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
 from rig.core.json_form import plain
 from rig.plans.enroll import similar_objects
-from rig.views.description import BENCH_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
 from rig.web.answers import (
     Bundle,
     Deleted,
@@ -232,9 +232,7 @@ def add_bundles(routes: Routes, server: Server) -> None:
 
         def store() -> Transferred:
             with server.catalog.open_to_change() as catalog, read_bundle(path, catalog.clock) as source:
-                done = finished(transfer(source, catalog, conflict=on_conflict, jobs=1))
-                views(catalog, BENCH_DESCRIPTOR)  # describes them, so that the next search does not wait
-                return done
+                return finished(transfer(source, catalog, conflict=on_conflict, descriptors=DESCRIPTORS, jobs=1))
 
         with TemporaryDirectory(prefix="rig-import-") as folder:
             path = Path(folder) / "upload.rigcat.zip"

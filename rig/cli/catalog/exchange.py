@@ -78,12 +78,11 @@ def import_(
 
     Example: rig import /media/stick/catalog --on-conflict skip --bench sim
     """
-    from rig.catalog.derived import load_views
     from rig.catalog.exchange.photographs import Photographs
     from rig.catalog.transfer import Conflict, transfer
     from rig.cli.ui.present import run_job, size_words
     from rig.core.json_form import plain
-    from rig.views.description import BENCH_DESCRIPTOR
+    from rig.views.description import DESCRIPTORS
 
     clock = SystemClock()
     begin_ns = clock.now_ns()
@@ -92,14 +91,12 @@ def import_(
             *(objects, catalog),
             conflict=Conflict(on_conflict),
             label=label,
+            descriptors=DESCRIPTORS,
             jobs=jobs,
             dry_run=dry_run,
         )
         what = "checking" if dry_run else "importing"
         done = run_job(what, job, interrupted="Interrupted; nothing was imported.")
-        if not dry_run:  # so that the next search does not wait
-            later = "Interrupted; everything was imported. The next search describes the views."
-            run_job("describing", load_views(catalog, BENCH_DESCRIPTOR), interrupted=later)
     seconds = seconds_between(begin_ns, clock.now_ns())
     lines = [
         f"{'Would import' if dry_run else 'Imported'} {counted(done.objects, 'object')} with "

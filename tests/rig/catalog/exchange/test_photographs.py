@@ -19,7 +19,7 @@ from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do
 from rig.evaluation.experiments import load_catalog
 from rig.search.model import load_model
-from rig.views.description import DESCRIPTORS
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
 from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, finished
 from tests.rig.catalog.exchange.exchange_samples import photograph, run_import, untouched
 
@@ -177,6 +177,20 @@ class TestTables:
         )
         done = run_import(open_catalog("catalog"), read_table(tmp_path / "views.csv", now=NOW))
         assert ([file.reason for file in done.rejected], done.views) == ([words], 1)
+
+    def test_photograph_that_cannot_be_described_with_the_others_is_rejected(
+        self, tmp_path: Path, open_catalog: OpenCatalog
+    ) -> None:
+        for angle, size in ((0, (48, 64)), (90, (40, 64)), (180, (48, 64))):
+            photograph(tmp_path / f"mug__{angle}.png", angle, size)
+        catalog = open_catalog("catalog")
+        done = run_import(catalog, read_folder(tmp_path, now=NOW), descriptors=DESCRIPTORS)
+        assert [(Path(file.path).name, file.code) for file in done.rejected] == [
+            ("mug__90.png", ImportProblem.NOT_DESCRIBED)
+        ]
+        assert done.views == 2
+        catalog.database.images.remove(catalog.database.images.names())  # a search needs only what was computed
+        assert views(catalog, BENCH_DESCRIPTOR).azimuth_deg.tolist() == [0.0, 180.0]
 
     @pytest.mark.parametrize("column", ["label", "note"])
     def test_text_with_control_characters_is_rejected(
