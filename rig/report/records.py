@@ -3,15 +3,14 @@
 A record has thumbnails instead of images, so that a long run needs little memory.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import accumulate, pairwise
 from typing import Any, ClassVar, Final
 
 from hbr import Outcome
 from hbr.core.angles import wrap180
-from rig.catalog import View
 from rig.charts.compass import PathStep
 from rig.events.events import (
     Accepted,
@@ -27,7 +26,6 @@ from rig.events.events import (
     SimilarObjects,
     Started,
     Verified,
-    event_of,
 )
 from rig.report.pictures import Image, Region, thumbnail
 from rig.views.capture import ViewEvidence, rejection_text
@@ -87,7 +85,7 @@ class _Record:
             case _:
                 pass
 
-    def _view(self, taken: Accepted, move: Moved | None = None, rejected: tuple[str, ...] = ()) -> ReportView:
+    def _view(self, taken: Accepted, move: Moved | None, rejected: tuple[str, ...]) -> ReportView:
         box = None if taken.segmentation is None else taken.segmentation.get("box_px")
         picture = thumbnail(taken.image_bgr, self.size, self._region, box)
         return ReportView(taken.index, taken.azimuth_deg, picture, taken.evidence, move, rejected)
@@ -118,18 +116,6 @@ class EnrollmentRecord(_Record):
             self.result = event
         elif isinstance(event, SimilarObjects):
             self.similar = event
-
-    def complete(self, stored: Iterable[tuple[View, Mapping[str, Any], Image]]) -> None:
-        """Add the stored views of earlier sessions, which this report did not see, with their segmentations."""
-        seen = {view.index for view in self.views}
-        for view, segmentation, image_bgr in stored:
-            if view.index not in seen:
-                taken = {name: getattr(view, name) for name in ("index", "azimuth_deg", "evidence")}
-                event = event_of({"event": "accepted", **taken, "segmentation": segmentation or None})
-                assert isinstance(event, Accepted)
-                self.views.append(self._view(replace(event, image_bgr=image_bgr)))
-        self.views.sort(key=lambda view: view.index)
-        self.planned = max(self.planned, len(self.views))
 
 
 @dataclass(frozen=True, slots=True)
