@@ -353,7 +353,7 @@ class _Plan:
                 return there is not None
             owner, own = there.enrollment.object_id, ids.get(item.name)
             is_used = own is None or (owner == own and there.status is EnrollmentStatus.COMPLETE)
-            return owner in used and is_used and seal_of(there.enrollment) == seal_of(item.enrollment)
+            return owner in used and is_used and _are_equal(there.enrollment, item.enrollment)
 
         wanted = [item for item in self.wanted if not is_there(item)]
         both = [item.name for item in wanted if item.name in ids]
@@ -401,7 +401,7 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
         if (
             there is not None
             and there.enrollment.object_id == object_id
-            and seal_of(there.enrollment) == seal_of(enrollment)
+            and _are_equal(there.enrollment, enrollment)
         ):
             enrollment = there.enrollment  # an earlier one of the object: it comes into use again
         else:
@@ -416,6 +416,11 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
             columns |= state.columns(None, item.created_utc, texts)
         log.append(transaction, target.clock, Action.IMPORTED, item.name, **columns)
     return new
+
+
+def _are_equal(one: Enrollment, other: Enrollment) -> bool:
+    """Return whether two enrollments with one key have the same views; photographs have a new time at each import."""
+    return [view.digest for view in one.views] == [view.digest for view in other.views]
 
 
 def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> Enrollment:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 
 import cv2
@@ -177,6 +178,14 @@ class TestTables:
         )
         done = run_import(open_catalog("catalog"), read_table(tmp_path / "views.csv", now=NOW))
         assert ([file.reason for file in done.rejected], done.views) == ([words], 1)
+
+    def test_same_photographs_are_not_added_again(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
+        photograph(tmp_path / "mug__0.png", 0)
+        catalog = open_catalog("catalog")
+        run_import(catalog, read_folder(tmp_path, now=NOW))
+        done = run_import(catalog, read_folder(tmp_path, now=NOW + timedelta(days=1)), Conflict.REPLACE)
+        assert (done.objects, done.skipped) == (0, ("mug",))
+        assert len(catalog.object("mug").enrollments) == 1
 
     def test_photograph_that_cannot_be_described_with_the_others_is_rejected(
         self, tmp_path: Path, open_catalog: OpenCatalog
