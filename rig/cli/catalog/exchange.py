@@ -213,10 +213,10 @@ def export(
         # Which objects: names, a label, or both.
         wanted = list(names or [])
         if label is not None:
-            labelled = [item.name for item in catalog.objects() if item.label == label]
+            labelled = [item.name for item in catalog.objects() if item.label == label and item.views]
             wanted = [name for name in labelled if not wanted or name in wanted]
             if not wanted:
-                raise ExportFailed(f"No object has the label {label!r}.", next_step=Do.LIST_OBJECTS())
+                raise ExportFailed(f"No enrolled object has the label {label!r}.", next_step=Do.LIST_OBJECTS())
         source = CatalogSource(catalog, wanted)
         match form:
             case "coco" | "yolo":
