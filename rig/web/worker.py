@@ -68,7 +68,7 @@ class BenchWorker:
         self.setup = setup
         self.attempts = Attempts(clock)
         """Those to open the catalog."""
-        self.status: dict[str, Any] = {}
+        self.status: dict[str, Any] = {"open": False, "job": None, "error": None, "problem": None}
         """The last known state of the bench, as JSON values; a new dict after each change."""
         self.views: dict[str, list[bytes]] = {}
         """Pictures of the last jobs as JPEG."""
