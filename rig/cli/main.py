@@ -70,6 +70,16 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
 
 
+class _Subcommands(TyperGroup):
+    """The commands of a group, each with its first sentence; the help of Typer cuts it at the end of the line."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(name, self.commands[name].get_short_help_str(limit=200)) for name in self.list_commands(ctx)]
+            )
+
+
 @contextmanager
 def _usage_error(*, json: bool) -> Iterator[None]:
     """Neutralise an error in the arguments, and print it as JSON; Typer prints it as text."""
@@ -151,7 +161,7 @@ SECTIONS: Final[dict[str, dict[str, Any]]] = {
 
 def _add(name: str, one: Any) -> None:
     if isinstance(one, typer.Typer):
-        app.add_typer(one, name=name)
+        app.add_typer(one, name=name, cls=_Subcommands)
     else:  # the angle of goto can be negative
         app.command(name, context_settings={"ignore_unknown_options": True} if name == "goto" else None)(one)
 

@@ -107,3 +107,9 @@ def test_help_begins_with_the_ten_commands_of_a_day_and_names_every_command_once
     assert len(SECTIONS["Start here"]) == 10
     listed = re.findall(r"^  ([a-z][a-z-]+) +[A-Z]", shown, re.MULTILINE)
     assert listed == [name for names in SECTIONS.values() for name in names]
+
+
+def test_help_of_a_group_cuts_no_sentence():
+    for group in (name for names in SECTIONS.values() for name, one in names.items() if isinstance(one, typer.Typer)):
+        shown = CliRunner().invoke(app, [group, "--help"], env={"COLUMNS": "80"}).output
+        assert not re.search(r"\w\.\.\.$", shown, re.MULTILINE), group
