@@ -9,7 +9,7 @@
 #define COLOURS 8 /* of a texture class, each in three shades */
 #define SHADES 4  /* three, and a zero */
 
-/* The tables of hbr/descriptors/cedd_tables.py. */
+/* The tables of hbr/descriptors/cedd.py. */
 struct cedd_tables {
     const double *hue_weight;      /* (2, 360) */
     const int64_t *hue_bin;        /* (2, 360): first bin of the two colours of each hue */

@@ -1,4 +1,4 @@
-/* The Tanimoto coefficient of rows of bytes, with the same bits as hbr/descriptors/tanimoto.py. */
+/* The Tanimoto coefficient of rows of bytes, with the same bits as hbr/descriptors/similarity.py. */
 #include "kernels.h"
 
 #define LONGEST 4096

@@ -19,7 +19,7 @@ def identify(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Search strategy: dense, arc (dense in motion), ahbr, hbr, sweep, random, hmm or that of a plug-in "
+            help="Search strategy: dense, arc (dense in motion), ahbr, hbr, sweep, random or hmm "
             "(default: identify.strategy).",
         ),
     ] = None,
