@@ -99,7 +99,7 @@ def enroll(
             if stored_views:
                 one = changed(Do.CONTINUE_ENROLLMENT(name=name), options=tuple(settings.arguments()))
                 step = one if tray is None else f"To continue, run the same command again: rig enroll --list {tray}"
-                print(in_words(("The views taken so far are stored.", step)), file=sys.stderr)
+                print(f"The views taken so far are stored. {in_words(step)}", file=sys.stderr)
             raise
     if tray is not None and not settings.json:
         print(f"{enrolled} of {len(items)} objects enrolled in this run.", file=sys.stderr)
