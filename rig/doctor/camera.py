@@ -276,7 +276,8 @@ def _flicker(
     spread = (max(levels) - min(levels)) / max(levels)
     # Every second column of the green channel is enough for the levels of rows.
     lamp = mains_flicker(np.array([frame[:, ::2, 1].mean(axis=1) for frame in frames]), times_ns)
-    exposure_us = source.read_locks().exposure_us or 1e4
+    reported_us = source.read_locks().exposure_us
+    exposure_us = reported_us or 1e4
     if lamp is not None:
         fix: SomeSteps = _exposure_without_bands(lamp.mains_hz, exposure_us)
         yield warning("camera", FindingCode.MAINS_FLICKER, fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
@@ -285,7 +286,7 @@ def _flicker(
         yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
     else:
         for hz in standing_mains_hz(times_ns):
-            if abs(whole_periods_us(hz, exposure_us) - exposure_us) > EXPOSURE_STEP_US:
+            if reported_us is None or abs(whole_periods_us(hz, exposure_us) - exposure_us) > EXPOSURE_STEP_US:
                 steps = as_steps(_exposure_without_bands(hz, exposure_us))
                 parameters = {"mains_hz": hz}
                 yield Finding("camera", Severity.FINE, FindingCode.STANDING_FLICKER_NOT_CHECKED, parameters, steps)

@@ -1,10 +1,13 @@
 """Lamps that flicker with the mains are named, and the exposure without bands."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from rig.core.next_steps import Do
-from rig.doctor.camera import mains_flicker, standing_mains_hz, whole_periods_us
+from rig.devices.camera import CameraLocks
+from rig.doctor.camera import _flicker, mains_flicker, standing_mains_hz, whole_periods_us
 from rig.doctor.finding import FindingCode, Severity
 from sim.faults import Fault, Faults
 from tests.rig.doctor.doctor_parts import unopened
@@ -63,6 +66,16 @@ def test_bands_that_would_stand_still_are_named_with_the_exposure_without_them()
     assert found[FindingCode.STANDING_FLICKER_NOT_CHECKED] == (Do.SET_KEY(key="camera.exposure_us", value="8333"),)
     codes = {f.code for f in bench_findings("camera.exposure_us=8333")}
     assert FindingCode.STANDING_FLICKER_NOT_CHECKED not in codes
+
+
+@pytest.mark.parametrize(("exposure_us", "names_it"), [(None, True), (5_000.0, True), (10_000.0, False)])
+def test_bands_that_would_stand_still_are_named_unless_the_exposure_is_known_to_have_none(exposure_us, names_it):
+    locks = CameraLocks(exposure_us, None, None, None, None)
+    times_ns = (np.arange(11) / 25 * 1e9).astype(np.int64)  # at 25 frames/s, those of 50 Hz mains
+    frames = [np.full((480, 4, 3), 90, np.uint8)] * 11
+    found = list(_flicker(SimpleNamespace(read_locks=lambda: locks), frames, times_ns, {"mean_levels": [90.0, 90.0]}))
+    assert bool(found) == names_it
+    assert all(one.steps == (Do.SET_KEY(key="camera.exposure_us", value="10000"),) for one in found)
 
 
 def bench_findings(*settings):
