@@ -18,7 +18,6 @@
 #define SDA PC4
 #define SCL PC5
 
-#define TICKS_PER_US 2U /* of timer 1 */
 #define BYTE_US (10U * 1000000UL / BAUD)
 
 static struct head head;
@@ -48,7 +47,7 @@ static uint32_t micros_locked(void) {
     if (TIFR1 & _BV(TOV1) && low < 0x8000) {
         high++; /* the timer has just overflowed; the interrupt has not counted it yet */
     }
-    return (high << 15) + (low >> 1);
+    return (high << 15) + (low >> 1); /* timer 1 counts half microseconds */
 }
 
 uint32_t hal_micros(void) {

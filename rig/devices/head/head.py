@@ -1,4 +1,4 @@
-"""The rig head: an IMU with its own clock, the light, the camera's trigger, the e-stop and the servo's power.
+"""The rig head: an IMU with its own clock, the light, the e-stop and the servo's power.
 
 The head sends samples by itself, dated by its clock. A heartbeat in the background keeps its outputs on and compares
 the clocks. When the program dies, the heartbeat ends and the head switches its outputs off.
