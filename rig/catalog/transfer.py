@@ -398,11 +398,7 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
         object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
         assert object_id is not None
         enrollment, there = item.enrollment, plan.known.get(item.enrollment.key)
-        if (
-            there is not None
-            and there.enrollment.object_id == object_id
-            and _are_equal(there.enrollment, enrollment)
-        ):
+        if there is not None and there.enrollment.object_id == object_id and _are_equal(there.enrollment, enrollment):
             enrollment = there.enrollment  # an earlier one of the object: it comes into use again
         else:
             if there is not None:  # with other views, or of an object that is deleted or has another name

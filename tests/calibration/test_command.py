@@ -56,11 +56,6 @@ def results_in(folder) -> list[CalibrationResult]:
     return [CalibrationResult.from_file(path) for path in sorted((folder / "sim").iterdir())]
 
 
-def test_help_has_an_example_and_lists_the_procedures(rig):
-    assert "Example: rig calibrate imu" in " ".join(rig("calibrate", "imu", "--help").output.split())
-    assert "imu" in rig("calibrate", "--help").output
-
-
 def test_passed_results_are_stored_and_in_force(rig, tmp_path, imu_calibration):
     folder, output = imu_calibration
     paths = sorted((folder / "sim").iterdir())
@@ -78,18 +73,6 @@ def test_passed_results_are_stored_and_in_force(rig, tmp_path, imu_calibration):
     assert other["bound_deg"] > 1.5, "another world has another gyro"
 
 
-def test_json_is_one_object_per_line_and_ends_with_the_result(rig, monkeypatch):
-    for slow in (ImuMounting, GyroRotation):
-        monkeypatch.setattr(slow, "measure", lambda *_: (event for event in ()))
-    done = rig("calibrate", "imu", "--revolutions", "4", "--seed", "6", "--json")
-    events = [json.loads(line) for line in done.stdout.splitlines()]
-    assert {event["event"] for event in events} == {"moved", "calibrated"}
-    (scale,) = [event for event in events if event["event"] == "calibrated"]
-    assert (scale["passed"], scale["rejections"]) == (True, [])
-    assert scale["estimates"]["scale"]["uncertainty"] < 1.5e-4
-    assert scale == events[-1]
-
-
 def test_rejected_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, imu_calibration):
     copytree(imu_calibration[0], tmp_path / "calibrations")
     done = rig("calibrate", "imu", "--revolutions", "4", "--set", "imu.axis=x")
@@ -99,10 +82,6 @@ def test_rejected_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, im
     passed = [result.passed for result in results_in(tmp_path / "calibrations")]
     assert passed == [True, True, True, False]
     assert json.loads(rig("goto", "90", "--json").stdout)["bound_deg"] < 1.5
-
-
-def test_too_few_revolutions_are_a_usage_error(rig):
-    assert rig("calibrate", "imu", "--revolutions", "3").exit_code == 2
 
 
 def test_servo_results_replace_earlier_ones(rig, tmp_path, monkeypatch, servo_calibration):
@@ -186,16 +165,6 @@ def test_person_at_a_terminal_is_asked_also_with_json(rig, monkeypatch):
     assert done.exit_code == 6
     assert "Enter: continue, q: stop" in done.stderr
     assert done.stdout == ""
-
-
-def test_request_of_a_calibration_is_not_among_its_json(rig, monkeypatch):
-    monkeypatch.setattr(table_axis, "ANGLES_DEG", (0.0,))
-    nothing = camera_model.evaluate([], CharucoBoard(), (640, 480)).result(when_utc=SystemClock().utc(), device={})
-    monkeypatch.setattr("calibration.procedure.in_force", lambda *_: nothing)
-    done = rig("calibrate", "table", "--json")
-    assert done.exit_code == 6, "views from one side are too few"
-    assert "Put the calibration board upright" in done.stderr
-    assert json.loads(done.stdout.splitlines()[-1])["passed"] is False
 
 
 def test_board_is_printed_without_a_bench(rig, tmp_path):

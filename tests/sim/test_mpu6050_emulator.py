@@ -219,17 +219,17 @@ def test_bias_walks_at_the_models_pace() -> None:
 
 def test_flicker_noise_has_one_allan_deviation_at_all_times_however_it_is_read() -> None:
     floor = (0.004, 0.0, 0.001)
-    times_ns = np.arange(1, 200_001, dtype=np.int64) * 100_000_000
+    times_ns = np.arange(1, 40_001, dtype=np.int64) * 100_000_000
 
     def rates(parts: int) -> Any:
         part = InertialModel(World(noise=NoiseModel.none().with_values(gyro_flicker_dps=floor)), "imu")
         return np.concatenate([part.sample(some, 10.0, 4.9)[0] for some in np.array_split(times_ns, parts)])
 
     read = rates(1)
-    assert rates(997) == pytest.approx(read, abs=1e-12)
+    assert rates(97) == pytest.approx(read, abs=1e-12)
     for axis, expected in enumerate(floor):
         tau_s, deviation, _ = allan(read[:, axis], 0.1)
-        between = (tau_s > 2) & (tau_s < 300)
+        between = (tau_s > 2) & (tau_s < 60)
         assert deviation[between] == pytest.approx(expected, rel=0.2, abs=1e-12)
 
 

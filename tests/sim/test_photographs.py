@@ -121,9 +121,9 @@ def test_demo_enrolls_photographs_and_searches_in_the_others(rig: Rig) -> None:
 
 def test_objects_are_found_by_the_photographs_that_were_not_enrolled(rig: Rig) -> None:
     save(Path("photographs"), step_deg=22.5)
-    Path("tray.csv").write_text("name\nobj1\nobj2\nobj10\n")
+    Path("tray.csv").write_text("name\nobj2\nobj10\n")
     assert rig("enroll", "--list", "tray.csv", "--yes", *put(every=2)).exit_code == 0
-    for name in COLOURS:
+    for name in ("obj2", "obj10"):
         for azimuth_deg, image in stored_views(name):
             shown_deg = nearest_angle(name, image, 22.5)
             assert shown_deg % 45 == 0
@@ -141,8 +141,8 @@ def test_objects_are_found_by_the_photographs_that_were_not_enrolled(rig: Rig) -
 
 def test_watch_shows_one_object_after_the_other(rig: Rig) -> None:
     save(Path("photographs"))
-    for name in COLOURS:
-        assert rig("enroll", name, "--yes").exit_code == 0
+    for name in ("obj1", "obj2"):
+        assert rig("enroll", name, "--views", "4", "--yes").exit_code == 0
 
     done = rig("identify", "--watch", "--json", *put(object='["obj2","obj1","nothing"]'))
     events = [json.loads(line) for line in done.stdout.splitlines()]
@@ -202,60 +202,42 @@ def test_doctor_finds_no_problem_with_the_camera(rig: Rig) -> None:
     assert not [one for one in found if one.get("level") == "bad"], done.stdout
 
 
-def _no_folder(_: Path) -> None:
-    pass
+def replaced(image: Image) -> Callable[[Path], object]:
+    """Return a function that saves photographs, and one of them with this image."""
+    return lambda folder: cv2.imwrite(str(save(folder) / "obj1__90.png"), image)
 
 
-def _empty_folder(folder: Path) -> None:
-    folder.mkdir()
-
-
-def _one_angle(folder: Path) -> None:
-    save(folder, step_deg=360)
-
-
-def _two_sizes(folder: Path) -> None:
-    save(folder)
-    cv2.imwrite(str(folder / "obj1__90.png"), np.zeros((90, SIZE, 3), np.uint8))
-
-
-def _grey(folder: Path) -> None:
-    save(folder)
-    cv2.imwrite(str(folder / "obj1__90.png"), np.zeros((SIZE, SIZE), np.uint8))
-
-
-def _small(folder: Path) -> None:
+def small(folder: Path) -> None:
     folder.mkdir()
     cv2.imwrite(str(folder / "obj1__0.png"), np.zeros((60, 60, 3), np.uint8))
 
 
-def _damaged(folder: Path) -> None:
-    save(folder)
-    whole = (folder / "obj1__90.png").read_bytes()
-    (folder / "obj1__90.png").write_bytes(whole[: len(whole) // 2])
+def damaged(folder: Path) -> None:
+    file = save(folder) / "obj1__90.png"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
 @pytest.mark.parametrize(
-    ("prepare", "words"),
+    ("prepare", "said", "step"),
     [
-        (_no_folder, ("There is no folder photographs", "bench.photographs.source")),
-        (_empty_folder, ("No photograph in photographs", "bench.photographs.pattern")),
-        (_one_angle, ("obj1 has 1 photograph to enroll it with", "Add photographs")),
-        (_two_sizes, ("obj1__90.png has 100 x 90 pixels", "one size")),
-        (_grey, ("obj1__90.png is grey", "in colour")),
-        (_small, ("60 x 60 pixels", "Scale the photographs")),
-        (_damaged, ("obj1__90.png cannot be used: truncated", "Replace or remove")),
+        (lambda _: None, "There is no folder photographs", "bench.photographs.source"),
+        (Path.mkdir, "No photograph in photographs", "bench.photographs.pattern"),
+        (lambda folder: save(folder, step_deg=360), "obj1 has 1 photograph to enroll it with", "Add photographs"),
+        (replaced(np.zeros((90, SIZE, 3), np.uint8)), "obj1__90.png has 100 x 90 pixels", "one size"),
+        (replaced(np.zeros((SIZE, SIZE), np.uint8)), "obj1__90.png is grey", "in colour"),
+        (small, "60 x 60 pixels", "Scale the photographs"),
+        (damaged, "obj1__90.png cannot be used: truncated", "Replace or remove"),
     ],
 )
 def test_unusable_photographs_are_errors_with_a_next_step(
-    rig: Rig, prepare: Callable[[Path], None], words: tuple[str, str]
+    rig: Rig, prepare: Callable[[Path], object], said: str, step: str
 ) -> None:
     prepare(Path("photographs"))
     done = rig("enroll", "obj1", "--yes")
     assert done.exit_code in (2, 3)
-    said = " ".join(done.stderr.split())
-    assert words[0] in said
-    assert words[1] in said.split("Next step:")[1]
+    what, _, next_step = " ".join(done.stderr.split()).partition("Next step:")
+    assert said in what
+    assert step in next_step
 
 
 def test_bench_without_a_source_names_the_key(rig: Rig) -> None:

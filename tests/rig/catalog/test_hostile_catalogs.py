@@ -7,7 +7,7 @@ import sqlite3
 import stat
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -444,16 +444,6 @@ STATEMENTS = (
 )
 
 
-@pytest.mark.parametrize("statement", STATEMENTS)
-def test_edited_rows_are_found(root: Path, statement: str) -> None:
-    sql(root, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", statement)
-    try:
-        with opened(root) as catalog:
-            assert finished(verify(catalog, jobs=1)).findings
-    except CatalogDamaged:
-        pass
-
-
 SHOWN: dict[str, Callable[[Catalog], Any]] = {
     "list": lambda catalog: catalog.objects(),
     "show": lambda catalog: ascii(
@@ -483,22 +473,32 @@ SHOWN: dict[str, Callable[[Catalog], Any]] = {
 """What commands show."""
 
 
-@pytest.mark.parametrize("reader", SHOWN)
-def test_no_edited_fact_is_accepted(root: Path, sample: Path, reader: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def shown(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Return what commands show of the catalog before it is edited."""
+    with opened(Path(shutil.copytree(sample, tmp_path_factory.mktemp("shown") / "catalog"))) as catalog:
+        return {reader: show(catalog) for reader, show in SHOWN.items()}
+
+
+def edited(root: Path, statement: str) -> None:
+    sql(root, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", statement)
+
+
+@pytest.mark.parametrize("statement", STATEMENTS)
+def test_edited_rows_are_found_and_never_shown(root: Path, shown: dict[str, Any], statement: str) -> None:
     """Each command shows what was stored, or that the catalog is damaged."""
-    with opened(root) as catalog:
-        expected = SHOWN[reader](catalog)
+    edited(root, statement)
+    with suppress(CatalogDamaged), opened(root) as catalog:
+        assert finished(verify(catalog, jobs=1)).findings
     accepted = []
-    for number, statement in enumerate(STATEMENTS):
-        edited = Path(shutil.copytree(sample, tmp_path / str(number)))
-        sql(edited, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", statement)
+    for reader, show in SHOWN.items():
         try:
-            with opened(edited) as catalog:
-                if SHOWN[reader](catalog) != expected:
-                    accepted.append(statement)
+            with opened(root) as catalog:
+                if show(catalog) != shown[reader]:
+                    accepted.append(reader)
         except CatalogDamaged as error:
             if not error.next_step:
-                accepted.append(f"{statement}: no next step")
+                accepted.append(f"{reader}: no next step")
     assert accepted == []
 
 
@@ -576,34 +576,34 @@ def test_flipped_bytes_are_found_or_change_nothing(root: Path, sample: Path, cou
 
 VALUES = (
     "views SET azimuth_deg = 'north'",
-    "views SET azimuth_deg = 360.5",
     "views SET azimuth_deg = 9e999",
-    "views SET azimuth_deg = NULL",
     "views SET evidence = '{'",
-    "views SET evidence = NULL",
     "views SET captured_utc = 'yesterday'",
-    "views SET image = x'00ff'",
     "views SET session = 7",
-    "views SET view_index = 700 WHERE id IN (1, 4)",
     "views SET digest = NULL",
     "log SET status = 'lost'",
     "log SET object_name = NULL WHERE id = 1",
     "log SET details = '[]'",
     "log SET record = '{}' WHERE result = 1",
-    "log SET result = 9223372036854775807 WHERE result = 1",
     "enrollments SET planned_azimuth_deg = '[null]'",
-    "enrollments SET planned_azimuth_deg = NULL",
-    "enrollments SET object_id = 77",
     "sessions SET devices = '7'",
     """sessions SET conditions = '{"a":NaN}'""",
-    "sessions SET number = 5",
     "properties SET value = '²  0 0 0' WHERE key = 'head'",
     "properties SET value = '99999999999999999999  0 0 0' WHERE key = 'head'",
-    "derived SET content = 'text'",
     "derived SET content = x''",
     *(
         pytest.param(edit, marks=pytest.mark.nightly)
         for edit in (
+            "views SET azimuth_deg = 360.5",
+            "views SET azimuth_deg = NULL",
+            "views SET evidence = NULL",
+            "views SET view_index = 700 WHERE id IN (1, 4)",
+            "views SET image = x'00ff'",
+            "enrollments SET planned_azimuth_deg = NULL",
+            "sessions SET number = 5",
+            "derived SET content = 'text'",
+            "enrollments SET object_id = 77",
+            "log SET result = 9223372036854775807 WHERE result = 1",
             "views SET evidence = '[1]'",
             "views SET evidence = '{\"locks\":5}'",
             "views SET region = '[0,0,5,5]'",
@@ -659,7 +659,7 @@ def test_invalid_values_end_in_an_error(
 ) -> None:
     """Values that no program stored end in an error, even if a sender gave them the right digests."""
     root, strange = without_constraints, ("properties", "derived", "log SET result", "log SET record")
-    sql(root, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", f"UPDATE {edit}")
+    edited(root, f"UPDATE {edit}")
     if sealed and not edit.startswith("properties"):
         seal_as_the_sender(root)
     restore_schema(root, sample)

@@ -61,27 +61,13 @@ class TestVerify:
         ("statement", "found"),
         [
             ("UPDATE views SET azimuth_deg = 7 WHERE id = 2", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
-            ("UPDATE views SET image = 'x' WHERE id = 2", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
-            ("UPDATE views SET evidence = x'00' WHERE id = 5", (CatalogProblem.ENROLLMENT_CHANGED, "tin")),
-            ("DELETE FROM views WHERE id = 5", (CatalogProblem.ENROLLMENT_CHANGED, "tin")),
-            ("UPDATE sessions SET software = '?' WHERE enrollment_id = 1", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
-            ("UPDATE enrollments SET planned_azimuth_deg = '[0]'", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
             ("UPDATE enrollments SET id = 7 WHERE id = 2", (CatalogProblem.MISSING_ENROLLMENT, "tin")),
-            ("UPDATE log SET label = 'x' WHERE id = 1", (CatalogProblem.LOG_CHANGED, "mug")),
             ("UPDATE log SET user = 'x' WHERE id = 4", (CatalogProblem.LOG_CHANGED, "tin")),
             ("DELETE FROM log WHERE id = 2", (CatalogProblem.LOG_CHANGED, None)),
-            ("DELETE FROM log WHERE id = 4", (CatalogProblem.LOG_CHANGED, None)),
             ("UPDATE properties SET value = '4 x' WHERE key = 'head'", (CatalogProblem.DAMAGED_DATABASE, None)),
-            (
-                "UPDATE properties SET value = replace(value, (SELECT digest FROM log WHERE id = 4), "
-                "(SELECT digest FROM log WHERE id = 3)) WHERE key = 'head'",
-                (CatalogProblem.LOG_CHANGED, "tin"),
-            ),
-            ("UPDATE properties SET value = value || '7' WHERE key = 'head'", (CatalogProblem.DAMAGED_DATABASE, None)),
-            ("UPDATE log SET enrollment_id = 'x' WHERE id = 1", (CatalogProblem.DAMAGED_DATABASE, None)),
         ],
     )
-    def test_changed_rows_are_found(
+    def test_changed_rows_are_named(
         self, catalog: Catalog, statement: str, found: tuple[CatalogProblem, str | None]
     ) -> None:
         sql(catalog, statement)

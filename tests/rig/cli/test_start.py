@@ -51,12 +51,12 @@ def interrupted(
     ("moment", "words"),
     [
         ("rig.cli.main", "--version"),
-        ("typer", "--version"),
         ("rig.core.signals", "goto 90 --bench sim"),
-        ("rig.cli.objects.runs", "goto 90 --bench sim"),
         ("rig.bench", "goto 90 --bench sim"),  # the command has begun
-        ("numpy", "goto 90 --bench sim"),
         ("cv2", "goto 90 --bench sim"),
+        pytest.param("typer", "--version", marks=pytest.mark.nightly),
+        pytest.param("rig.cli.objects.runs", "goto 90 --bench sim", marks=pytest.mark.nightly),
+        pytest.param("numpy", "goto 90 --bench sim", marks=pytest.mark.nightly),
     ],
 )
 def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words, tmp_path):
@@ -67,7 +67,12 @@ def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words,
 
 
 @pytest.mark.parametrize(
-    ("moment", "words"), [("atexit", "--version"), ("threads", "--version"), ("threads", "config show")]
+    ("moment", "words"),
+    [
+        ("atexit", "--version"),
+        ("threads", "config show"),
+        pytest.param("threads", "--version", marks=pytest.mark.nightly),
+    ],
 )
 def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, words, tmp_path):
     done = interrupted(tmp_path, moment, *words.split())

@@ -17,7 +17,7 @@ from rig.events.events import Accepted
 from rig.jobs.table_image import refresh_table_image
 from rig.plans.enroll import enroll
 from rig.views.empty_table import empty_table_status
-from tests.small import SMALL
+from tests.small import SMALL, SMALL_WORDS
 
 
 def test_enrollment_takes_the_image_once_a_day(rig: Callable[..., Any]) -> None:
@@ -46,7 +46,6 @@ def test_name_is_checked_before_the_table_is_cleared(rig: Callable[..., Any]) ->
         unfinished.close()
     Path("tray.csv").write_text("name\ndice\n")
     before = Path("state/sim/state.json").read_bytes()
-    small = [word for setting in SMALL for word in ("--set", setting)]
     for arguments, code in (
         (("dice",), 7),
         (("toy-car",), 7),
@@ -55,7 +54,7 @@ def test_name_is_checked_before_the_table_is_cleared(rig: Callable[..., Any]) ->
         (("a\nb",), 2),
         (("--list", "tray.csv"), 0),
     ):
-        done = rig("enroll", *arguments, *small)
+        done = rig("enroll", *arguments, *SMALL_WORDS)
         assert done.exit_code == code, arguments
         assert "Empty-table image" not in done.stderr
     assert Path("state/sim/state.json").read_bytes() == before

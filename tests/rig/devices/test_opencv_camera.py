@@ -249,19 +249,6 @@ def test_network_stream_is_current_after_a_pause(
 # -- focus and other controls --------------------------------------------------------------------------------------
 
 
-def test_focus_is_locked_and_reported(world: World) -> None:
-    """Autofocus would change the image of the same object in the next session, so it is off by default."""
-    capture = SimCapture(world)
-    capture.drift(autofocus=True)
-    camera = OpenCvCamera(capture, clock=world.clock)
-    locks = camera.read_locks()
-    assert locks.autofocus is False
-    assert locks.focus is not None
-    assert not [n for n in camera.rejected_settings if "focus" in n.setting]
-    capture.drift(autofocus=True)
-    assert camera.read_locks() != locks
-
-
 def test_fixed_lens_needs_no_focus(world: World) -> None:
     class Fixed(SimCapture):
         def get(self, prop: int) -> float:
@@ -341,6 +328,9 @@ def test_autofocus_is_pinned_where_it_settles(world: World) -> None:
     capture.drift(autofocus=True, focus=0)
     camera = OpenCvCamera(capture, clock=world.clock)
     assert (camera.read_locks().focus, camera.read_locks().autofocus) == (120, False)
+    assert camera.rejected_settings == ()
+    capture.drift(autofocus=True)  # by another program
+    assert camera.read_locks().autofocus is True
 
 
 def test_focus_is_stored_for_the_next_program(simulated, world: World) -> None:

@@ -15,7 +15,7 @@ from rig.core.next_steps import Do
 from rig.doctor.checks import CHECKS
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.examination import Check, run_checks
-from rig.doctor.finding import Finding, FindingCode, Severity, finding_words, fine
+from rig.doctor.finding import FindingCode, Severity, fine
 from sim.faults import Fault, Faults, fault_kinds
 from tests.rig.catalog.catalog_samples import fill
 from tests.rig.doctor.doctor_parts import unopened
@@ -380,14 +380,3 @@ def test_hanging_or_failing_check_stops_no_other():
         ("broken", FindingCode.CHECK_FAILED, (Do.REPORT_DEFECT(),), 1),
         ("well", FindingCode.ONLY_SERVO, (), 0),
     ]
-
-
-def test_finding_is_put_into_words_with_its_parameters():
-    elsewhere = Finding(
-        "servo", Severity.BAD, FindingCode.OTHER_SERVOS, {"id": 1, "baud": 57_600, "port": "COM3", "found": ["a", "b"]}
-    )
-    assert finding_words(elsewhere) == "no servo answers at id 1, 57600 baud, COM3 (found: a, b)"
-    locked = fine("camera", FindingCode.LOCKED, settings=["gain 0", "focus 120"])
-    assert finding_words(locked) == "locked and read back: gain 0, focus 120"
-    assert finding_words(fine("config", FindingCode.CONFIG_MISTAKE, what=None, mistake=3)) == "?: 3"
-    assert locked.as_dict()["code"] == "locked"

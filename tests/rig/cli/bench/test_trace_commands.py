@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 import sim.servo.models
 from rig.cli.main import app
-from tests.small import SMALL
+from tests.small import SMALL_WORDS
 
 Rig = Callable[..., Result]
 
@@ -21,8 +21,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A trace of the simulated bench, whose IMU has a number that could be secret."""
     file = tmp_path_factory.mktemp("trace") / "bench.jsonl"
     port = ("--set", "servo.port=/dev/serial/by-id/usb-FTDI_FT4NZSECRET")
-    small = [word for setting in SMALL for word in ("--set", setting)]
-    done = CliRunner().invoke(app, ["servo", "record", str(file), "--bench", "sim", "--yes", *port, *small])
+    done = CliRunner().invoke(app, ["servo", "record", str(file), "--bench", "sim", "--yes", *port, *SMALL_WORDS])
     assert done.exit_code == 0, done.output
     assert f"Recorded {file}" in done.output
     return file.read_bytes()

@@ -87,6 +87,17 @@ def test_verify_names_the_object_and_sets_the_exit_code(two: Rig) -> None:
     assert two("catalog", "verify").exit_code == 0
 
 
+def test_interrupted_check_changes_nothing(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rig.catalog.verify.map_in_processes", interrupted)
+    stopped = two("catalog", "verify")
+    assert stopped.exit_code == 130
+    assert "Interrupted; nothing was changed." in stopped.stderr
+    assert "torque" not in stopped.stderr
+
+
 def test_identify_reports_another_region(rig: Rig) -> None:
     assert rig("enroll", "dice", "--views", "4").exit_code == 0
     moved = ("--set", "view.roi=[45, 0, 230, 240]", "--set", "bench.sim.object=dice", "--set", "identify.max_views=2")
@@ -102,29 +113,6 @@ def test_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:
     done = result(rig("import", "in", "--dry-run", "--json"))
     assert (done["objects"], done["views"], len(done["rejected"])) == (1, 4, 1)
     assert not Path("catalog").exists()
-
-
-@pytest.mark.parametrize(
-    ("target", "options"),
-    [("out.rigcat.zip", ()), ("out", ()), ("out.images", ("--format", "folder"))],
-)
-def test_export_can_be_imported(two: Rig, target: str, options: tuple[str, ...]) -> None:
-    assert result(two("export", target, "--json", *options))["objects"] == 2
-    other = ("--set", "catalog.path=other")
-    assert two("import", target, *other).exit_code == 0
-    assert two("catalog", "verify", *other).exit_code == 0
-    shown = [result(two("catalog", "show", "tin", "--json", *where))["views"] for where in ((), other)]
-    assert next([v["image_sha256"] for v in views] for views in shown) == [v["image_sha256"] for v in shown[1]]
-    assert [v["descriptors"] for v in shown[0]] == [v["descriptors"] for v in shown[1]]
-    again = two("import", target, *other)
-    if target.endswith(".zip"):  # these enrollments are in the catalog already
-        assert again.exit_code == 0
-        assert "Skipped, already in the catalog: mug, tin" in again.output
-    else:
-        assert again.exit_code == 7
-        assert "--on-conflict skip" in again.stderr
-    assert result(two("import", target, "--on-conflict", "skip", "--json", *other))["skipped"] == ["mug", "tin"]
-    assert two("export", target, *options).exit_code == 7  # it exists already
 
 
 def test_some_objects_are_exported(two: Rig) -> None:

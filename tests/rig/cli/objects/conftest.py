@@ -8,18 +8,14 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 from sim.bench import SimBenchKind
-
-SMALL = (
-    'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
-    "[view]\nroi = [40, 0, 240, 240]\n[enroll]\nviews = 6\n"
-)
+from tests.small import SMALL_FILE
 
 
 @pytest.fixture(scope="session")
 def original(tmp_path_factory):
     """Return a folder with two enrolled objects and a saved run."""
     folder = tmp_path_factory.mktemp("day")
-    (folder / "rig.toml").write_text(SMALL, encoding="utf-8")
+    (folder / "rig.toml").write_text(f"{SMALL_FILE}[enroll]\nviews = 6\n", encoding="utf-8")
     outputs = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 from typer.testing import CliRunner
 
@@ -26,7 +27,7 @@ def in_json(done):
 def test_each_search_of_watch_asks_for_the_sample(enrolled, monkeypatch):
     monkeypatch.chdir(enrolled[0])
     command = ["identify", "--watch", "--scan", "--operator", "A. Silva", "--json", "--set", "bench.sim.object=dice"]
-    done = CliRunner().invoke(app, command, input="S-1\nS\x1d2\nS-2\n\n")
+    done = CliRunner().invoke(app, [*command, "--save-run", "runs"], input="S-1\nS\x1d2\nS-2\n\n")
     assert done.exit_code == 2  # the answers have ended
     events = in_json(done)
     assert [event["sample"] for event in events if event.get("event") == "recorded"] == ["S-1", "S-2", None]
@@ -35,6 +36,8 @@ def test_each_search_of_watch_asks_for_the_sample(enrolled, monkeypatch):
     assert "cannot be printed" in done.stderr
     listed = in_json(CliRunner().invoke(app, ["results", "list", "--json", "--sample", "S-2"]))
     assert [one["operator"] for one in listed] == ["A. Silva"]
+    assert sorted(path.name for path in Path("runs").iterdir())[:3] == ["0001", "0002", "0003"]
+    assert CliRunner().invoke(app, ["replay", "runs/0002", "--check"]).exit_code == 0
 
 
 def test_sample_of_watch_is_that_of_the_object_on_the_table(rig, with_operator, monkeypatch):

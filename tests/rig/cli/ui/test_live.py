@@ -16,13 +16,14 @@ from rig.cli.ui.settings import Settings
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
-from rig.events.events import Event, FrameUsed, Item, SimilarObject, SimilarObjects, SkipReason, Waiting, WaitReason
+from rig.events.events import Event, FrameUsed, Item, SimilarObject, SimilarObjects
 from rig.motion.move import MotionTimes
 from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Question
 from rig.plans.tray import TrayItem, after_error, next_object
 from tests.programs import Program
-from tests.rig.report.report_samples import enrolling, identifying, searching_densely
+from tests.rig.report.report_samples import enrolling, searching_densely
+from tests.small import SMALL_FILE
 
 SIMILAR = SimilarObjects(
     "mug-white", 180.0, 0.95, 0.96, (SimilarObject("mug-03", ((120.0, 200.0),), ((210.0, 110.0),), (), 0.2, 0.99),)
@@ -70,15 +71,6 @@ def test_enrollment_has_a_line_for_each_step_and_ends_with_similar_objects(shown
     assert ("of 8 views, " in text and "Ctrl+Z: pause" in text) == is_terminal(text)
 
 
-@pytest.mark.parametrize("answer", ["mug-white", None])
-def test_search_shows_candidates_and_decisions(shown, answer):
-    text = shown([Waiting(WaitReason.NEXT_OBJECT), *identifying(answer)])
-    assert "candidates: " in text
-    assert "left 47.3°: the leading candidates look less similar there: S_left 0.41 < S_right 0.66" in text
-    assert ("similar enrolled objects are mug-white" if answer is None else "mug-white, rotated 30°") in text
-    assert "258° of rotation, 10 s." in text
-
-
 def test_dense_search_shows_its_notes_once_and_its_decisions(shown):
     text = shown([*searching_densely(), *searching_densely()])
     assert text.count("Note: most objects were enrolled without an empty-table image") == 1
@@ -92,11 +84,6 @@ def test_frames_are_lines_in_a_pipe_and_at_a_terminal_only_the_last_line(shown):
     words = "in motion: mug-star 62.2 %; view 12, azimuth 34.8°, 1.0 s (2 frames rejected)"
     assert (f"  {words}\n" in text) != is_terminal(text)
     assert is_terminal(text) or "enough to end the search" in text
-
-
-def test_skipped_objects_are_reported(shown):
-    text = shown([Item(1, 2, "mug", "skip", SkipReason.ALREADY_ENROLLED)])
-    assert "1 of 2  mug: skipped, it is already enrolled\n" in text
 
 
 STOPPING = """
@@ -121,11 +108,7 @@ main()
 
 @pytest.fixture
 def folder(tmp_path):
-    (tmp_path / "rig.toml").write_text(
-        'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
-        "[view]\nroi = [40, 0, 240, 240]\n",
-        encoding="utf-8",
-    )
+    (tmp_path / "rig.toml").write_text(SMALL_FILE, encoding="utf-8")
     return tmp_path
 
 
