@@ -8,6 +8,7 @@ import gc
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing import forkserver, get_context
 from multiprocessing.connection import Connection
@@ -17,7 +18,7 @@ from subprocess import TimeoutExpired
 from threading import Thread
 from typing import IO
 
-from rig.core.clock import SystemClock
+from rig.core.clock import SystemClock, seconds_between
 
 _SERVER = get_context("forkserver")
 _SERVER.set_forkserver_preload(
@@ -98,8 +99,7 @@ class Program:
     def wait_until_stopped(self) -> None:
         """Wait until the program has stopped itself, as by SIGSTOP."""
         stat = Path(f"/proc/{self.pid}/stat")
-        while stat.read_text().rpartition(")")[2].split()[0] != "T":
-            SystemClock().sleep(0.005)
+        until(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T", every_s=0.005)
 
     def kill(self) -> None:
         self._process.kill()
@@ -135,6 +135,15 @@ class Program:
             if stream is not None:
                 with suppress(BrokenPipeError):
                     stream.close()
+
+
+def until(reached: Callable[[], object], seconds: float = 60.0, every_s: float = 0.01) -> None:
+    """Wait for another program, which may take long on a busy computer."""
+    clock = SystemClock()
+    begun_ns = clock.now_ns()
+    while not reached():
+        assert seconds_between(begun_ns, clock.now_ns()) < seconds
+        clock.sleep(every_s)
 
 
 def stopping_after_view(number: int) -> str:

@@ -7,7 +7,6 @@ from calibration.backlash import Backlash, evaluate
 from calibration.legs import Leg
 from calibration.procedure import Evaluation
 from rig.calibrations import CalibrationResult, RejectionCode
-from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Moved
 from sim.noise import NoiseModel
 from tests.calibration.rejected import codes
@@ -92,12 +91,3 @@ def test_slipping_platter_is_rejected(simulated):
     s = simulated(seed=3)
     result = run(s, during={9: lambda: s.world.slip(0.8, 0.2)})
     assert RejectionCode.LEG_SLIPPED in codes(result)
-
-
-def test_short_cable_and_too_few_reversals_are_rejected_before_moving(simulated):
-    s = simulated('table.mode="pan"', "table.limits_deg=[-20, 20]")
-    with pytest.raises(LimitExceeded):
-        next(Backlash(24).live(s.bench))
-    with pytest.raises(UsageError):
-        next(Backlash(reversals=2).live(s.bench))
-    assert abs(s.world.table_deg()) < 1.0

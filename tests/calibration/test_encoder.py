@@ -8,7 +8,6 @@ from calibration.legs import Leg
 from calibration.procedure import Evaluation
 from rig.bench import calibrate
 from rig.calibrations import CalibrationStore, RejectionCode
-from rig.core.errors import LimitExceeded, UsageError
 from rig.motion.turntable import Turntable
 from sim.noise import NoiseModel
 from tests.calibration.rejected import codes
@@ -106,11 +105,3 @@ def test_excessive_error_and_slip_are_rejected():
     )
     rejection = fit(steps).rejections[0]
     assert (rejection.code, rejection.values["leg"]) == (RejectionCode.LEG_SLIPPED, 8)
-
-
-def test_short_cable_and_zero_revolutions_are_rejected_before_moving(simulated):
-    s = simulated('table.mode="pan"', "table.limits_deg=[-90, 90]")
-    with pytest.raises(LimitExceeded):
-        next(Encoder(2).live(s.bench))
-    with pytest.raises(UsageError):
-        next(Encoder(revolutions=0).live(s.bench))

@@ -1,11 +1,13 @@
-"""Rejected calibrations on the bench: nothing of them is in force."""
+"""Rejected calibrations on the bench: nothing of them is in force, and what cannot be measured moves nothing."""
 
 import json
 
 import pytest
 
 from calibration import camera_model
+from calibration.procedures import Backlash, Encoder, GyroScale, ImuMounting
 from rig.calibrations import CalibrationStore, RejectionCode
+from rig.core.errors import LimitExceeded, UsageError
 
 
 @pytest.fixture
@@ -32,3 +34,31 @@ def test_wrong_board_and_moving_table_are_rejected(rig, tmp_path, monkeypatch, s
     assert not result.settings
     (reported,) = json.loads(rig("calibrate", "show", "--json").stdout)["calibrations"]
     assert reported["state"] != "in force"
+
+
+PAN = 'table.mode="pan"'
+
+
+@pytest.mark.parametrize(
+    ("procedure", "settings"),
+    [
+        (Encoder(2), (PAN, "table.limits_deg=[-90, 90]")),
+        (Backlash(24), (PAN, "table.limits_deg=[-20, 20]")),
+        (ImuMounting(), (PAN, "table.limits_deg=[-90, 90]")),
+        (GyroScale(8), ("table.limits_deg=[-180, 181]",)),
+    ],
+)
+def test_short_cable_is_rejected_before_moving(simulated, procedure, settings):
+    s = simulated(*settings)
+    with pytest.raises(LimitExceeded):
+        next(procedure.live(s.bench))
+    assert s.world.shaft()[0] == pytest.approx(0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("procedure", "moves"),
+    [(Encoder, {"revolutions": 0}), (Backlash, {"reversals": 2}), (GyroScale, {"revolutions": 3})],
+)
+def test_too_few_moves_are_rejected(procedure, moves):
+    with pytest.raises(UsageError, match="too few"):
+        procedure(**moves)

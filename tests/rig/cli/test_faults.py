@@ -17,16 +17,6 @@ def rig(*arguments: str):
     return CliRunner().invoke(app, list(arguments))
 
 
-def test_faults_are_listed_with_parameters():
-    text = rig("faults").stdout
-    for kind in fault_kinds().values():
-        assert f"{kind.name} " in text
-        assert kind.what in text
-        for name, parameter in kind.parameters.items():
-            assert f"{name}={parameter.default:g}  {parameter.meaning}" in text
-    assert "rig demo --fault" in text
-
-
 def test_faults_are_listed_as_json():
     listed = [json.loads(line) for line in rig("faults", "--json").stdout.splitlines()]
     assert [entry["fault"] for entry in listed] == list(fault_kinds())
@@ -68,12 +58,6 @@ def test_changed_bench_is_searched_with_the_faults_of_command_line_and_configura
     for name in ("crc_flip", "camera.slow", "i2c_nack"):
         assert f"fault begins: {name}" in done.stderr
         assert f"fault ends: {name}" in done.stderr
-
-
-def test_faults_of_the_configuration_apply_to_every_command():
-    done = rig("goto", "10", "--bench", "sim", "--set", 'bench.sim.faults=["unplug"]')
-    assert done.exit_code == 4
-    assert "Next step:" in done.stderr
 
 
 @pytest.mark.parametrize(

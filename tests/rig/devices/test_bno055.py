@@ -157,9 +157,6 @@ def test_stopped_fusion_is_detected(bench: ImuBench, imu: Bno055) -> None:
     assert "i2c-gpio" in caught.value.next_step
 
 
-# -- on a bench --------------------------------------------------------------------------------------------------------
-
-
 # -- clock stretching on a Raspberry Pi 4 -----------------------------------------------------------------------------
 
 

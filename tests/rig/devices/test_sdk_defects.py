@@ -110,15 +110,6 @@ def test_unstuffing_keeps_all_bytes(data: bytes) -> None:
     assert bus.read_block(1, 0, len(data)) == data
 
 
-def test_sdk_unstuffing_loses_a_byte() -> None:
-    data = b"\xff\xff\xfd\xff\xfd\xfd"
-    bus, _ = scripted_bus(status_packet(1, StatusPacket(0, data)))
-    sdk_data, result, _ = Protocol2PacketHandler().readTxRx(bus.port, 1, 0, len(data))
-    assert result == COMM_SUCCESS
-    assert len(sdk_data) == len(data)
-    assert bytes(sdk_data) != data  # the defect: the last byte is one of the CRC, under COMM_SUCCESS
-
-
 def test_values_are_signed() -> None:
     bus, _ = scripted_bus(*2 * [status_packet(1, StatusPacket(0, (-5000).to_bytes(4, "little", signed=True)))])
     assert Protocol2PacketHandler().read4ByteTxRx(bus.port, 1, 132)[0] == 4294962296
@@ -145,12 +136,6 @@ def test_header_in_data_is_stuffed(data: bytes) -> None:
     assert packet.parameters == b"\x54\0" + data
     after_header = wire.written[0][4:-2]  # the CRC is not stuffed
     assert not re.search(rb"\xff\xff\xfd(?!\xfd)", after_header)
-
-
-def test_sdk_does_not_stuff() -> None:
-    bus, wire = scripted_bus()
-    Protocol2PacketHandler().writeTxOnly(bus.port, 1, 84, 4, [0xFF, 0xFF, 0xFD, 0x00])
-    assert b"\xff\xff\xfd\x00" in wire.written[0][4:]  # a header in the middle of a packet
 
 
 # -- how long the SDK waits --------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,14 +14,12 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.cli.main import app
-from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import open_serial
 from sim.realtime.wire import send_command
 from tests.docs.pages import DOCS
-from tests.programs import Program
+from tests.programs import Program, until
 
-CLOCK = SystemClock()
 START = "from rig.cli.main import main; main()"
 PATIENCE_S = 60.0
 IN_DEPTH = ("A cable is unplugged", "A program is killed", "Enroll and identify")
@@ -57,14 +55,6 @@ def commands() -> Iterator[Typed]:
                     typed.answer += line + "\n"
             if typed:
                 yield typed
-
-
-def until(reached: Callable[[], bool]) -> None:
-    """Wait for progress, which may take long on a busy computer."""
-    start_ns = CLOCK.now_ns()
-    while not reached():
-        assert seconds_between(start_ns, CLOCK.now_ns()) < PATIENCE_S
-        CLOCK.sleep(0.02)
 
 
 def is_free(port: Path) -> bool:

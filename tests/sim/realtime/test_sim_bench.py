@@ -19,7 +19,7 @@ from smbus2 import SMBus, i2c_msg
 from rig.bench import open_bench
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
-from rig.core.clock import SystemClock, seconds_between
+from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, EmergencyStop, UsageError
 from rig.devices.dynamixel.port import open_serial
 from rig.devices.dynamixel.servo import open_servo
@@ -37,6 +37,7 @@ from sim.realtime.wire import SOCKET, Wire, send_command, short_path
 from sim.world import World
 from tests.contract.heads import needs
 from tests.fuzzing import fuzz_settings
+from tests.programs import until
 
 CLOCK = SystemClock()
 PATIENT = ("table.watchdog_s=2.5", "head.deadman_s=2.0", "servo.retries=20")
@@ -70,13 +71,6 @@ def answers(folder: Path) -> bool:
         return "world" in send_command(folder, "status")
     except (DeviceNotFound, FileNotFoundError):
         return False
-
-
-def until(reached: Callable[[], bool], patience_s: float = 30.0) -> None:
-    begun_ns = CLOCK.now_ns()
-    while not reached():
-        assert seconds_between(begun_ns, CLOCK.now_ns()) < patience_s
-        CLOCK.sleep(0.01)
 
 
 def error_of(call: Callable[[], object]) -> int | None:

@@ -2,7 +2,7 @@
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
-from hypothesis import assume, example, given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rig.devices.dynamixel.packets import Packets
@@ -86,12 +86,6 @@ def unstuffed(stuffed: bytes) -> bytes:
     return bytes(plain)
 
 
-def as_the_sdk_unstuffs(frame: bytes) -> bytes:
-    """Return instruction, error and parameters of a status packet as the SDK's `readRx` slices them out."""
-    plain = SDK.removeStuffing(list(frame))
-    return bytes(plain[7 : 7 + (plain[5] | plain[6] << 8) - 2])
-
-
 @quick
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
 @example(bus_id=1, error=0, data=b"\xff\xff\xfd\xff\xfd\xfd")
@@ -101,15 +95,6 @@ def test_byte_stuffing_removes_headers_and_can_be_undone(bus_id: int, error: int
     assert SDK.updateCRC(0, frame, len(frame) - 2) == frame[-2] | frame[-1] << 8
     assert unstuffed(frame[7:-2]) == bytes((0x55, error)) + data
     assert bytes(Packets().removeStuffing(list(frame))[7:-2]) == bytes((0x55, error)) + data
-
-
-@quick
-@given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
-def test_sdk_unstuffs_the_bytes_that_the_servo_stuffs(bus_id: int, error: int, data: bytes) -> None:
-    body = bytes((0x55, error)) + data
-    # After one stuffed byte it takes FF FD FD for another: rig.devices.dynamixel has its own function.
-    assume(b"\xff\xfd\xfd" not in body.partition(b"\xff\xff\xfd")[2])
-    assert as_the_sdk_unstuffs(status_packet(bus_id, StatusPacket(error, data))) == body
 
 
 @quick

@@ -6,11 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rig.core.clock import SystemClock
 from sim.realtime.wire import send_command
-from tests.programs import Program
+from tests.programs import Program, until
 
-CLOCK = SystemClock()
 OF_ITS_TERMINAL = """
 import fcntl, os, termios
 os.setsid()
@@ -63,19 +61,14 @@ def test_torque_is_off_however_jog_ends_in_motion(running_sim_bench: Path) -> No
         known: dict[str, float] = send_command(running_sim_bench, "status")["world"]
         return known
 
-    def until(condition: object, seconds: float = 30.0) -> None:
-        deadline_ns = CLOCK.now_ns() + round(seconds * 1e9)
-        while not condition():  # type: ignore[operator]
-            assert CLOCK.now_ns() < deadline_ns, world()
-            CLOCK.sleep(0.5)  # each answer takes time of the simulated bench
-
     Program("home", "--here", *config).communicate(30)
     for how, code in (("Ctrl+C", 130), ("hang-up", 128 + signal.SIGHUP), ("kill -9", -signal.SIGKILL), ("q", 0)):
         begun_deg = world()["table_deg"]
         terminal = Terminal(running_sim_bench, "--step", "90", *PATIENT, *config)
         terminal.wait_for(b"q end")
         terminal.press(RIGHT)
-        until(lambda begun_deg=begun_deg: world()["torque"] and abs(world()["table_deg"] - begun_deg) > 10)
+        # Each answer takes time of the simulated bench.
+        until(lambda begun_deg=begun_deg: world()["torque"] and abs(world()["table_deg"] - begun_deg) > 10, every_s=0.5)
         if how == "Ctrl+C":
             terminal.press(CTRL_C)
         elif how == "hang-up":
@@ -86,7 +79,7 @@ def test_torque_is_off_however_jog_ends_in_motion(running_sim_bench: Path) -> No
             terminal.wait_for(b"table at")
             terminal.press(b"q")
         assert terminal.program.wait(30) == code, how
-        until(lambda: not world()["torque"])
+        until(lambda: not world()["torque"], every_s=0.5)
         rotated_deg = abs(world()["table_deg"] - begun_deg)
         assert rotated_deg > 89 if how == "q" else rotated_deg < 80, how
         if how != "hang-up":

@@ -21,7 +21,7 @@ from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import GUARDIAN, open_serial
 from rig.devices.dynamixel.servo import open_servo
 from sim.realtime.wire import send_command
-from tests.programs import Program
+from tests.programs import Program, until
 from tests.sim.servo.served import start
 
 pytestmark = pytest.mark.realtime
@@ -188,7 +188,7 @@ def test_guardian_switches_the_torque_off_of_a_killed_program(servo, number):
     process, _ = moving(servo, GUARD="1")
     process.send_signal(signal.Signals[number])
     ended(process)
-    until(lambda: is_torque_off(servo), 30.0)
+    until(lambda: is_torque_off(servo))
 
 
 def test_next_command_waits_for_the_guardian_of_a_killed_program():
@@ -206,7 +206,7 @@ def test_next_command_waits_for_the_guardian_of_a_killed_program():
         return False
 
     try:
-        until(is_named, 30.0)
+        until(is_named)
         Computer().open_serial(port, 57_600).close()
     finally:
         guardian.wait(30.0)
@@ -253,11 +253,11 @@ def test_guardian_switches_the_torque_off_of_each_command_that_moves(running_sim
     def torque() -> bool:
         return send_command(running_sim_bench, "status")["world"]["torque"]
 
-    until(lambda: torque() or process.poll() is not None, 30.0)
+    until(lambda: torque() or process.poll() is not None)
     assert process.poll() is None, process.stdout.read()
     process.kill()
     process.communicate()
-    until(lambda: not torque(), 30.0)
+    until(lambda: not torque())
     assert not (tmp_path / "here" / "imported").exists()
 
 
@@ -265,13 +265,6 @@ def is_torque_off(settings: list[str]) -> bool:
     with suppress(DeviceNotFound):  # the guardian has opened the port
         return not observed(settings)[1]
     return False
-
-
-def until(condition, seconds: float) -> None:
-    deadline_ns = CLOCK.now_ns() + round(seconds * 1e9)
-    while not condition():
-        assert CLOCK.now_ns() < deadline_ns
-        CLOCK.sleep(0.02)
 
 
 @pytest.mark.parametrize(

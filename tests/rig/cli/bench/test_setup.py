@@ -137,17 +137,6 @@ def test_setup_json_is_one_object_per_line(home):
 # -- doctor and find --------------------------------------------------------------------------------------------------
 
 
-def test_doctor_prints_findings_with_fixes_and_exits_with_the_first_problem(parts, home):
-    done = rig("doctor")
-    assert done.exit_code == 4
-    lines = done.stdout.splitlines()
-    assert lines[0].startswith("✓ config      no rig.toml")
-    assert all(line[0] in "✓!✗ " or line == lines[-1] for line in lines)
-    marked = [i for i, line in enumerate(lines) if line[0] in "!✗"]
-    assert all(lines[i + 1].strip().startswith("→ ") for i in marked)
-    assert lines[-1].endswith("fine.")
-
-
 def test_doctor_json_has_a_fix_for_each_problem(parts, home):
     reported = json.loads(rig("doctor", "--json").stdout)
     assert reported["exit_code"] == 4

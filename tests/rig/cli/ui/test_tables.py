@@ -14,8 +14,3 @@ def test_rows_in_a_pipe_are_aligned_and_complete(capsys: pytest.CaptureFixture[s
         f"漢字 [bold]        7  {'x' * 300}",
         "\\u001b[31mred         end",
     ]
-
-
-def test_a_table_without_rows_has_its_header(capsys: pytest.CaptureFixture[str]) -> None:
-    print_table(("name", "views"), [])
-    assert capsys.readouterr().out == "name  views\n"
