@@ -71,7 +71,7 @@ def test_a_view_is_rejected_after_a_setting_has_drifted(
     bench: GuestBench, drift: dict[str, float], reason: str
 ) -> None:
     enroll = bench.start("enroll", f"drift-{next(iter(drift))[:4]}", "--views", 4)
-    bench.until_printed(enroll, "view 1 of 4")
+    bench.until_printed(enroll, "view 1, azimuth")
     with bench.played.time.present():
         bench.played.devices.camera.drift(**drift)
     ended = enroll.wait(300)
