@@ -63,6 +63,7 @@ class FirstDay:
     brltty_before: str
     brltty_after: str
     setup: Result
+    written: str
     settings: Result
     home: Result
 
@@ -80,11 +81,11 @@ def first_day(guest: GuestBench) -> FirstDay:
     guest.sh(f"tee {' '.join(RULES_FILES)} >/dev/null <<'END'\n{rules.output}END\n{trigger}")
     brltty_after = guest.sh(wants)
     after, link = guest.files(latency)[latency].strip(), guest.sh("readlink -f /dev/rig-servo")
-    setup = guest.rig("setup")
+    setup, written = guest.rig("setup"), guest.sh("cat rig.toml")
     added = (f"s/^\\[{section}\\]/" + "\\n".join((f"[{section}]", *lines)) + "/" for section, lines in PATIENT.items())
     guest.sh(f"sed -i '{'; '.join(added)}' rig.toml")
     settings, home = guest.rig("servo", "settings", "--write", "--yes"), guest.rig("home", "--here")
-    return FirstDay(find, rules, before, after, link, brltty_before, brltty_after, setup, settings, home)
+    return FirstDay(find, rules, before, after, link, brltty_before, brltty_after, setup, written, settings, home)
 
 
 @pytest.fixture

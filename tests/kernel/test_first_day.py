@@ -39,7 +39,8 @@ def test_setup_writes_the_configuration_and_checks_it(first_day: FirstDay) -> No
     output = first_day.setup.output
     assert "Wrote rig.toml." in output
     assert "✓ servo       /dev/ttyUSB0: XL430-W250, firmware 46, id 1 at 57600 baud" in output
-    assert PORT in output
+    assert f'port = "{PORT}"' in first_day.written.splitlines()
+    assert f'source = "{CAMERA}"' in first_day.written.splitlines()
     assert "✗ servo       EEPROM Operating Mode: 3 → 4" in output
     assert "✓ imu         MPU-6050 at 0x68" in output
     assert "✓ camera      frames timed by stamped exposure" in output

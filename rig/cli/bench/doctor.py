@@ -168,7 +168,8 @@ def setup(settings: Settings) -> None:
     with doctor_context(now) as context:
         computer, bench = context.computer, context.bench
         _, wanted = _scanned(context, sys.stderr if settings.json else sys.stdout)
-    if _PORT in wanted and computer.same_file(wanted[_PORT], stored.servo.port):
+    is_named = "port" in stored.servo.model_fields_set
+    if is_named and _PORT in wanted and computer.same_file(wanted[_PORT], stored.servo.port):
         wanted[_PORT] = stored.servo.port  # keep the configured name
     if ("imu", "address") in wanted:
         wanted["imu", "connection"] = "i2c"

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from rig.bench.hardware import HardwareBench
 from rig.cli.main import app
-from rig.config import load_config
+from rig.config import RigConfig, load_config
 from tests.rig.doctor.doctor_parts import unopened
 
 
@@ -60,6 +60,14 @@ def test_setup_writes_a_commented_file_that_works(home):
     assert again.exit_code == 0, again.output
     assert "is unchanged" in again.stdout
     assert (home / "rig.toml").read_bytes() == before
+
+
+def test_new_file_gets_the_name_of_the_port_that_stays(parts, home):
+    """The default port is the same device, but the next one that is connected may get its name."""
+    (port,) = parts.context.computer.serial_ports()
+    assert port.path == RigConfig().servo.port
+    rig("setup")
+    assert load_config(home / "rig.toml").servo.port.startswith("/dev/serial/by-id/")
 
 
 def test_setup_of_the_simulated_bench_keeps_the_devices_of_the_real_one(home):
