@@ -12,6 +12,7 @@ sends the length of a block. A device that stretches the clock (its attribute
 
 import ctypes
 import os
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -93,9 +94,9 @@ class KernelBus(AbstractContextManager["KernelBus"]):
         """Remove the bus; a second call does nothing."""
         self._file.close()
 
+    @abstractmethod
     def transfer(self, messages: Messages) -> list[bytes]:
         """Transfer messages and a stop; return the bytes of each read. Raises OSError with the kernel's number."""
-        raise NotImplementedError
 
     def ioctl(self, fd: int, request: int, argument: Any) -> int:
         """Serve one ``ioctl`` of ``/dev/i2c-N``; raises OSError with the kernel's number."""

@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
 from rig.catalog.database import Database
-from rig.catalog.describing import MOST_HELD_BYTES, described
+from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
 from rig.catalog.opening import open_database
 from rig.catalog.records import MAX_VIEWS, EnrollmentStatus, Provenance, as_json, checked_texts, clean_name, is_plan
@@ -458,8 +458,7 @@ class OpenEnrollment:
             view.digest = digest_of(view, self.enrollment.key)
             transaction.add(view)
             transaction.flush()
-        if sum(one.nbytes for one in self._held.values()) + image_bgr.nbytes <= MOST_HELD_BYTES:
-            self._held[view.image] = image_bgr
+        hold(self._held, view.image, image_bgr)
         return view
 
     def finish(self) -> None:

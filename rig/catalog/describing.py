@@ -103,6 +103,12 @@ def described(
 # Compute
 
 
+def hold(held: dict[str, Pixels], image: str, pixels: Pixels) -> None:
+    """Keep the pixels of an image, unless all images would have more than `MOST_HELD_BYTES`."""
+    if sum(one.nbytes for one in held.values()) + pixels.nbytes <= MOST_HELD_BYTES:
+        held[image] = pixels
+
+
 def reader(read: Callable[[str], Pixels], held: Mapping[str, Pixels] | None = None) -> Callable[[str], Pixels]:
     """Return a function that reads each image once: it holds pixels, ``held`` ones first, up to `MOST_HELD_BYTES`.
 
@@ -114,8 +120,7 @@ def reader(read: Callable[[str], Pixels], held: Mapping[str, Pixels] | None = No
         if image in known:
             return known[image]
         found = read(image)
-        if sum(one.nbytes for one in known.values()) + found.nbytes <= MOST_HELD_BYTES:
-            known[image] = found
+        hold(known, image, found)
         return found
 
     return pixels

@@ -142,9 +142,7 @@ def _read(reading: Reading, one: tuple[str, Enrollment]) -> ReadImages:
             if reading.is_named and name != image:
                 code, reason = ImportProblem.OTHER_IMAGE, OTHER_IMAGE
             elif reading.decodes:
-                pixels = decode(content)
-                if sum(one.nbytes for one in held.values()) + pixels.nbytes <= describing.MOST_HELD_BYTES:
-                    held[image] = pixels
+                describing.hold(held, image, decode(content))
         except BadImage as error:
             code, reason = ImportProblem.INVALID_IMAGE, f"cannot be used: {error}"
         except (CatalogDamaged, *_READ_ERRORS) as error:  # a link that leads out of a catalog is damage

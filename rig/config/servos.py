@@ -29,7 +29,7 @@ _USED: Final = (
     *("Velocity Limit", "Max Position Limit", "Min Position Limit", "Shutdown", "Torque Enable"),
     *("Status Return Level", "Hardware Error Status", "Bus Watchdog", "Profile Acceleration", "Profile Velocity"),
     *("Goal Position", "Realtime Tick", "Moving", "Moving Status", "Present Velocity", "Present Position"),
-    *("Position Trajectory", "Present Input Voltage", "Present Temperature"),
+    *("Velocity Trajectory", "Position Trajectory", "Present Input Voltage", "Present Temperature"),
 )
 
 

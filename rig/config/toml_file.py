@@ -30,13 +30,15 @@ MAX_DOTS: Final = 1000
 MAX_INTEGER: Final = 2**63
 """TOML 1.0, Integer: 64-bit signed."""
 
-MAX_LINES: Final = 100
-"""Of a value: each number of lines up to its end is tried."""
+MAX_TRIES: Final = 100
+"""Lines of one value at which it may end: each is tried, and a try takes as long as the value."""
 
 NONE: Final = "none"
 """The text that clears an optional key; TOML has no null."""
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_LAST_LINE = re.compile(r"""(?:[]}]|"{3}|'{3})\s*(?:#.*)?$""")
+"""Matches the last line of each value of several lines, and few others."""
 
 
 def loads(text: str) -> dict[str, Any]:
@@ -63,7 +65,7 @@ def loads(text: str) -> dict[str, Any]:
 
 
 def line_numbers(text: str) -> dict[Key, int]:
-    """Return the line of each key and table of a valid document. Raises `ValueError`: see `MAX_LINES`."""
+    """Return the line of each key and table of a valid document. Raises `ValueError`: see `MAX_TRIES`."""
     return {statement.key: statement.begin + 1 for statement in _statements(StringIO(text).readlines())}
 
 
@@ -187,10 +189,13 @@ def _statements(lines: list[str]) -> Iterator[_Statement]:
             yield _Statement(table, table, begin, at, is_header=True)
         elif line and not line.startswith("#"):
             # The lines of a value are those that tomllib can parse.
+            tries = 0
             while _parsed("".join(lines[begin:at])) is None:
                 at += 1
-                if at - begin > MAX_LINES:
-                    raise ValueError(f"the value in line {begin + 1} has more than {MAX_LINES} lines")
+                while not _LAST_LINE.search(lines[at - 1]):
+                    at += 1
+                if (tries := tries + 1) > MAX_TRIES:
+                    raise ValueError(f"the value in line {begin + 1} has too many lines that end with a bracket")
             if table is not None:
                 yield _Statement((*table, *_key_of(lines[begin])[0]), table, begin, at)
 

@@ -121,7 +121,7 @@ class FindingCode(Enum):
     FEW_FRAMES = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second, not {fps:.3g}"
     MAINS_FLICKER = (
         "the lamps flicker with the mains ({mains_hz:.0f} Hz): bands of {depth:.0%} in the images; an exposure of "
-        "of whole periods of the lamp has none"
+        "whole periods of the lamp has none"
     )
     STANDING_FLICKER_NOT_CHECKED = (
         "bands of lamps at {mains_hz:.0f} Hz mains would stand still in the images, and are not checked; an exposure "

@@ -138,11 +138,12 @@ def jog(desk: Desk, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -> 
                             continue
                         case JogKey.END:
                             break
-                        case JogKey.LARGER_STEP | JogKey.SMALLER_STEP:
-                            if key is JogKey.LARGER_STEP:
-                                step_deg = min((step for step in STEPS_DEG if step > step_deg), default=step_deg)
-                            else:
-                                step_deg = max((step for step in STEPS_DEG if step < step_deg), default=step_deg)
+                        case JogKey.LARGER_STEP:
+                            step_deg = min((step for step in STEPS_DEG if step > step_deg), default=step_deg)
+                            yield Remark(f"step {step_deg:g}°", is_warning=False)
+                            continue
+                        case JogKey.SMALLER_STEP:
+                            step_deg = max((step for step in STEPS_DEG if step < step_deg), default=step_deg)
                             yield Remark(f"step {step_deg:g}°", is_warning=False)
                             continue
                         case JogKey.HOME:

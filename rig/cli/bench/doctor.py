@@ -1,6 +1,5 @@
 """`rig doctor`, `rig find` and `rig setup`: the bench to check, its devices, its findings."""
 
-import json
 import sys
 from collections import deque
 from contextlib import contextmanager
@@ -90,9 +89,7 @@ def still_trace(settings: Settings) -> bytes:
     with TemporaryDirectory() as folder:
         file = Path(folder) / "trace.jsonl"
         try:
-            deque(
-                record(CommandDesk(settings.merged(overrides=[f"trace={json.dumps(str(file))}"])), still=True), maxlen=0
-            )
+            deque(record(CommandDesk(settings.tracing(file)), still=True), maxlen=0)
         except RigError:
             if not file.exists():
                 raise

@@ -1,6 +1,5 @@
 """`rig servo ...`."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -115,7 +114,7 @@ def record(
     with doctor_context(settings) as context:
         port = context.computer.serial_port(context.config.servo.port)
     adapter = {key: port.usb.get(key) for key in ("idVendor", "idProduct")} if port else {}
-    desk = CommandDesk(settings.merged(overrides=[f"trace={json.dumps(str(file))}"]))
+    desk = CommandDesk(settings.tracing(file))
     desk.run(record_job(desk, still=still, adapter={**adapter, "latency_ms": port.latency_ms if port else None}))
 
 

@@ -98,7 +98,7 @@ def enroll(
             view.hide()
             if stored_views:
                 one = changed(Do.CONTINUE_ENROLLMENT(name=name), options=tuple(settings.arguments()))
-                step = one if tray is None else f"To continue, run the same command again: rig enroll --list {tray}"
+                step = one if tray is None else "To continue with the list, run the same command again."
                 print(f"The views taken so far are stored. {in_words(step)}", file=sys.stderr)
             raise
     if tray is not None and not settings.json:

@@ -57,6 +57,10 @@ class Settings:
             json=json or self.json,
         )
 
+    def tracing(self, file: Path) -> "Settings":
+        """Return these settings, with a trace of the next bench in a file."""
+        return self.merged(overrides=[f"trace={json.dumps(str(file))}"])
+
     def load(self) -> "RigConfig":
         """Return the configuration in force; it is read once."""
         return self._loaded

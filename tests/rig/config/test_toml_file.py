@@ -58,10 +58,15 @@ def test_value_of_several_lines_stays_as_a_comment():
     assert f"{old}limits_deg = [-720, 720]\n" in edited
 
 
-def test_value_of_too_many_lines_is_rejected():
+def test_long_table_of_a_value_does_not_hinder_an_edit():
+    table = "a = [\n" + "  [1, 2],  # the third\n" * 1000 + "]\n"
+    assert with_values(f"{table}[servo]\n", {("servo", "id"): 2}) == f"{table}[servo]\nid = 2\n"
+
+
+def test_value_that_may_end_at_too_many_lines_is_rejected():
     with pytest.raises(ConfigError, match=r"Cannot set servo\.id") as caught:
-        with_values("a = [\n" + "1,\n" * 200 + "]\n", {("servo", "id"): 2})
-    assert "more than 100 lines" in caught.value.evidence["reason"]
+        with_values("a = [\n" + "[1]\n,\n" * 200 + "]\n", {("servo", "id"): 2})
+    assert "too many lines that end with a bracket" in caught.value.evidence["reason"]
 
 
 def test_inline_table_keeps_its_other_values():
