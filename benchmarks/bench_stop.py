@@ -30,12 +30,12 @@ from rig.safety.stop_channel import StopRequest
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 LOGGING_BENCH = """
 import sys, time
-from sim.servo.device import XSeriesServo
-log, usual = open(sys.argv.pop(1), "a", buffering=1), XSeriesServo._on_torque_enable
+from sim.servo.device import SimServo
+log, usual = open(sys.argv.pop(1), "a", buffering=1), SimServo._on_torque_enable
 def logged(servo):
     log.write(f"{time.monotonic_ns()} {servo.memory['Torque Enable']}\\n")
     usual(servo)
-XSeriesServo._on_torque_enable = logged
+SimServo._on_torque_enable = logged
 from rig.cli.main import main
 main()
 """

@@ -20,19 +20,19 @@ from sim.imu.inertial import SimulatedImu
 from sim.objects.projection import Image
 from sim.objects.shelf import shelf
 from sim.servo import ServoBus, SimSerial
-from sim.servo.device import XSeriesServo
+from sim.servo.device import SimServo
 from sim.servo.shaft import Geared, Shaft
 from sim.world import SimObject, World
 
 
-def simulated_servo(world: World, config: ServoConfig) -> XSeriesServo:
+def simulated_servo(world: World, config: ServoConfig) -> SimServo:
     """Return the servo that ``config`` describes, with factory settings, on the table's shaft or behind its gear.
 
     Raises `ConfigError` if there is no simulated servo of that model, or the model does not have the baud rate.
     """
     shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
     try:
-        return XSeriesServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
+        return SimServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
     except ValueError as error:
         raise ConfigError(
             "The simulated bench has no such servo.",
@@ -51,7 +51,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
 
     world: World
     servo_bus: ServoBus
-    servo: XSeriesServo
+    servo: SimServo
     adapter: SimSerial
     i2c: SimI2cBus | SimHead
     imu: SimulatedImu
@@ -135,7 +135,7 @@ def _imu(config: RigConfig, world: World) -> SimulatedImu:
     return imu
 
 
-def _head(config: RigConfig, world: World, servo: XSeriesServo) -> SimHead:
+def _head(config: RigConfig, world: World, servo: SimServo) -> SimHead:
     """Return a rig head whose ring light is the only light and whose relay supplies the servo.
 
     Raises `ConfigError` if the firmware cannot be built on this computer.

@@ -9,7 +9,7 @@ import numpy as np
 from rig.core.clock import seconds_between
 from sim.devices import SimDevices
 from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
-from sim.servo import SentBytes, XSeriesServo
+from sim.servo import SentBytes, SimServo
 from sim.servo.control_table import Memory
 from sim.servo.device import OVERLOAD_ERROR
 from sim.world import World
@@ -169,7 +169,7 @@ def _unplug(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> 
 def _duplicate_id(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
     first = devices.servo
     world = World(noise=devices.world.noise, seed=devices.world.seed + 1, clock=devices.world.clock)
-    twin = XSeriesServo(world, first.model.name, bus_id=first.bus_id, baudrate=first.baudrate)
+    twin = SimServo(world, first.model.name, bus_id=first.bus_id, baudrate=first.baudrate)
     devices.servo_bus.attach(twin)
     return lambda: devices.servo_bus.detach(twin)
 

@@ -1,8 +1,8 @@
 """Simulated Dynamixel servos on a simulated bus: byte-true Protocol 2.0 on the virtual clock."""
 
 from sim.servo.bus import Sender, SentBytes, ServoBus
-from sim.servo.device import XSeriesServo
+from sim.servo.device import SimServo
 from sim.servo.serial import SimSerial
 from sim.servo.shaft import Geared
 
-__all__ = ["Geared", "Sender", "SentBytes", "ServoBus", "SimSerial", "XSeriesServo"]
+__all__ = ["Geared", "Sender", "SentBytes", "ServoBus", "SimSerial", "SimServo"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from sim.clock import VirtualClock
-from sim.servo.device import XSeriesServo
+from sim.servo.device import SimServo
 from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, status_packet
 
 BITS_PER_BYTE = 10  # a start bit, 8 data bits, a stop bit
@@ -71,17 +71,17 @@ class ServoBus:
         self.filters: list[Callable[[SentBytes], SentBytes | None]] = []
         self.echo = False
         self.deaf = False
-        self._devices: list[XSeriesServo] = []
+        self._devices: list[SimServo] = []
         self._deliver: Callable[[SentBytes], None] | None = None
         self._sent_until_ns = 0
         self._parser = PacketParser()
         self._last_frame = SentBytes(Sender.HOST, 0, 1, b"")
 
-    def attach(self, device: XSeriesServo) -> None:
+    def attach(self, device: SimServo) -> None:
         """Connect a servo to the bus."""
         self._devices.append(device)
 
-    def detach(self, device: XSeriesServo) -> None:
+    def detach(self, device: SimServo) -> None:
         """Disconnect a servo from the bus; ValueError if it is not connected."""
         self._devices.remove(device)
 

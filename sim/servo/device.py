@@ -27,7 +27,7 @@ _TIME_BASED = 0x04  # bit of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 
 
-class XSeriesServo:
+class SimServo:
     """A servo whose horn is the table's shaft.
 
     If one register of a block rejects its value, nothing of the block is written. The answer to a new id, baud rate or

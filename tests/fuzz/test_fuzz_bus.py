@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from sim.clock import VirtualClock
 from sim.noise import NoiseModel
-from sim.servo import ServoBus, XSeriesServo
+from sim.servo import ServoBus, SimServo
 from sim.servo.protocol2 import with_crc
 from sim.world import World
 from tests.fuzzing import fuzz_settings
@@ -34,7 +34,7 @@ INSTRUCTIONS = st.one_of(
 def test_any_request_leaves_the_bus_alive(bus_id, instruction, parameters):
     clock = VirtualClock()
     bus = ServoBus(clock)
-    bus.attach(XSeriesServo(World(noise=NoiseModel.none(), clock=clock), "xl430_w250", bus_id=1, baudrate=57600))
+    bus.attach(SimServo(World(noise=NoiseModel.none(), clock=clock), "xl430_w250", bus_id=1, baudrate=57600))
     answers = []
     bus.connect(answers.append)
     body = bytes([instruction]) + parameters.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")

@@ -24,7 +24,7 @@ from sim.faults import Fault, Faults
 from sim.imu.inertial import InertialModel
 from sim.imu.mpu6050 import BANDWIDTH_HZ
 from sim.noise import NoiseModel
-from sim.servo import XSeriesServo
+from sim.servo import SimServo
 from sim.servo.models import ServoModel
 from sim.servo.motor import Motor
 from sim.world import World
@@ -177,7 +177,7 @@ def simulated_xl430() -> Fit:
     found = []
     for seed in range(20):
         world = World(noise=SERVO, seed=seed)
-        motor = XSeriesServo(world).motor
+        motor = SimServo(world).motor
         motor.hold()
         motor.go_to(180.0, 90.0, 240.0)
         world.clock.sleep(1.5)

@@ -18,7 +18,7 @@ from rig.safety.saved_state import MemoryStore, SessionEnd, StateStore
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
-from sim.servo import Sender, SentBytes, ServoBus, SimSerial, XSeriesServo
+from sim.servo import Sender, SentBytes, ServoBus, SimSerial, SimServo
 from sim.world import World
 
 
@@ -28,7 +28,7 @@ class Wires:
 
     world: World
     bus: ServoBus
-    device: XSeriesServo
+    device: SimServo
     serial: SimSerial
     sent: list[SentBytes] = field(default_factory=list)
     i2c: SimI2cBus | None = None
@@ -42,7 +42,7 @@ class Wires:
 def servo_wires(noise: NoiseModel | None = None, seed: int = 0, **servo: Any) -> Wires:
     world = World(noise=noise, seed=seed)
     bus = ServoBus(world.clock)
-    device = XSeriesServo(world, **servo)
+    device = SimServo(world, **servo)
     bus.attach(device)
     wires = Wires(world, bus, device, SimSerial(bus, device.baudrate, READ_SLICE_S))
     bus.taps.append(wires.sent.append)
@@ -59,7 +59,7 @@ def open_servo(wires: Wires, **options: Any) -> DynamixelServo:
     return servo
 
 
-def at_rest(servo: XSeriesServo, goal_deg: float, error_deg: float = 0.3) -> Any:
+def at_rest(servo: SimServo, goal_deg: float, error_deg: float = 0.3) -> Any:
     """Return what an angle at rest equals after a motion upwards to a goal: friction holds the table short of it."""
     return pytest.approx(goal_deg - servo.motor.held_deg, abs=error_deg)
 

@@ -18,7 +18,7 @@ from sim.clock import VirtualClock
 from sim.computer import ComputerFiles, SimComputer
 from sim.devices import SimDevices
 from sim.noise import NoiseModel
-from sim.servo import Sender, SentBytes, XSeriesServo
+from sim.servo import Sender, SentBytes, SimServo
 from sim.world import World
 
 
@@ -31,9 +31,9 @@ class Bench:
     context: DoctorContext
     sent: list[SentBytes] = field(default_factory=list)
 
-    def add_servo(self, bus_id: int, baud: int, model: str = "xl430_w250") -> XSeriesServo:
+    def add_servo(self, bus_id: int, baud: int, model: str = "xl430_w250") -> SimServo:
         """Connect another servo to the bus."""
-        servo = XSeriesServo(World(clock=self.devices.world.clock), model, bus_id=bus_id, baudrate=baud)
+        servo = SimServo(World(clock=self.devices.world.clock), model, bus_id=bus_id, baudrate=baud)
         self.devices.servo_bus.attach(servo)
         return servo
 

@@ -28,7 +28,7 @@ from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import FileStore
 from rig.safety.supervisor import TableState
 from sim.faults.environment import fill_disk
-from sim.servo import XSeriesServo
+from sim.servo import SimServo
 from tests.rig.bench_parts import BRAKED_S, Wires, at_rest, kill, program, sensor, servo_wires
 
 
@@ -229,7 +229,7 @@ def test_different_servo_is_rejected(other, start, wires):
         with pytest.raises(DeviceSilent), Turntable(bench) as table:
             after(wires, 0.7, lambda: wires.bus.detach(wires.device))
             table.goto(90.0)
-        wires.bus.attach(XSeriesServo(wires.world, **other))
+        wires.bus.attach(SimServo(wires.world, **other))
         with pytest.raises(DeviceMismatch), Turntable(bench):
             pass
         assert bench.safety.state is TableState.DISCONNECTED
@@ -458,7 +458,7 @@ def test_replugged_adapter_is_opened_again_and_checked(simulated, when):
         adapter.unplug()
         table.goto(60.0)
     s.operator.devices.servo_bus.detach(s.operator.devices.servo)
-    s.operator.devices.servo_bus.attach(XSeriesServo(s.world, "xl330_m288"))
+    s.operator.devices.servo_bus.attach(SimServo(s.world, "xl330_m288"))
     adapter.replug()
     with pytest.raises(DeviceMismatch) as caught, Turntable(s.bench):
         pass

@@ -8,7 +8,7 @@ from rig.devices.dynamixel.port import ClockedPort
 from rig.devices.dynamixel.registers import ControlTable, control_table
 from sim.clock import VirtualClock
 from sim.noise import NoiseModel
-from sim.servo import Sender, SentBytes, ServoBus, SimSerial, XSeriesServo
+from sim.servo import Sender, SentBytes, ServoBus, SimSerial, SimServo
 from sim.world import World
 
 ALERT = 0x80
@@ -32,12 +32,12 @@ class Line:
         self.serial = SimSerial(self.bus, self.baudrate, timeout=0.002)
         self.port = ClockedPort(self.serial, self.clock)
         self.sdk = Protocol2PacketHandler()
-        self.servos: dict[int, XSeriesServo] = {}
+        self.servos: dict[int, SimServo] = {}
         self.worlds: dict[int, World] = {}
 
-    def add(self, bus_id: int = 1, model: str = "xl430_w250", **options: int) -> XSeriesServo:
+    def add(self, bus_id: int = 1, model: str = "xl430_w250", **options: int) -> SimServo:
         world = World(noise=self.noise, clock=self.clock)
-        servo = XSeriesServo(world, model, bus_id=bus_id, baudrate=options.pop("baudrate", self.baudrate), **options)
+        servo = SimServo(world, model, bus_id=bus_id, baudrate=options.pop("baudrate", self.baudrate), **options)
         self.bus.attach(servo)
         self.servos[bus_id] = servo
         self.worlds[bus_id] = world
