@@ -80,6 +80,21 @@ class _Rotation:
     due: deque[tuple[int, Callable[[], object]]] = field(default_factory=deque)
 
 
+def check_angle(target_deg: float, limits_deg: tuple[float, float], from_deg: float | None = None) -> None:
+    """Raise `LimitExceeded` if the target is outside the cable budget, `UsageError` if it is not a number."""
+    if not isfinite(target_deg):
+        raise UsageError(f"{target_deg} is not an angle.", next_step="Give an angle in degrees.")
+    low, high = limits_deg
+    if not low <= target_deg <= high:
+        start = {} if from_deg is None else {"from_deg": round(from_deg, 2)}
+        raise LimitExceeded(
+            f"The table cannot rotate{'' if from_deg is None else f' from {angle_words(from_deg)}'} to "
+            f"{angle_words(target_deg)}: its cable budget is {budget_words(limits_deg)}.",
+            next_step="Give an angle within these limits: add or subtract 360° for the same view.",
+            evidence={**start, "to_deg": target_deg, "limits_deg": [low, high]},
+        )
+
+
 class Turntable(AbstractContextManager["Turntable"]):
     """The table of an open bench, with torque on for the duration of a ``with`` block.
 
@@ -174,16 +189,7 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def check_target(self, target_deg: float) -> None:
         """Raise `LimitExceeded` if the target is outside the cable budget, `UsageError` if it is not a number."""
-        if not isfinite(target_deg):
-            raise UsageError(f"{target_deg} is not an angle.", next_step="Give an angle in degrees.")
-        low, high = self._config.limits_deg
-        if not low <= target_deg <= high:
-            raise LimitExceeded(
-                f"The table cannot rotate from {angle_words(self._rest_deg)} to {angle_words(target_deg)}: its cable "
-                f"budget is {budget_words((low, high))}.",
-                next_step="Give an angle within these limits: add or subtract 360° for the same view.",
-                evidence={"from_deg": round(self._rest_deg, 2), "to_deg": target_deg, "limits_deg": [low, high]},
-            )
+        check_angle(target_deg, self._config.limits_deg, self._rest_deg)
 
     def within_reach(self, target_deg: float) -> float:
         """Return the angle within the limits that is equivalent to ``target_deg`` and nearest to the present angle.

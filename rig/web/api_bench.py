@@ -10,6 +10,8 @@ from typing import Annotated, Any, Final
 from fastapi import Header, Request, Response, WebSocket, WebSocketDisconnect
 
 from rig.core.errors import JobNotFound, TooManyListeners
+from rig.motion.turntable import check_angle
+from rig.web.access import Role
 from rig.web.answers import (
     EventStream,
     Health,
@@ -23,9 +25,10 @@ from rig.web.answers import (
     Svg,
 )
 from rig.web.hub import MAX_LISTENERS
-from rig.web.requests import AnswerBody, Job, JobRequest, LeaseBody, LoginBody
-from rig.web.server import API, COOKIE, OperatorPerson, Page, Routes, Server, Watcher, require_operate
+from rig.web.requests import AnswerBody, GotoRequest, Job, JobRequest, LeaseBody, LoginBody
+from rig.web.server import API, COOKIE, OperatorPerson, Page, Routes, Server, Watcher, require_operate, schemes
 
+IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
     201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
 }
@@ -59,7 +62,8 @@ def add_access(routes: Routes, server: Server) -> None:
         mine = server.lease.is_held_by(person)
         return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
 
-    @routes.watch.post("/lease", tags=["access"], response_model=LeaseState)
+    # It has no role of its group: a request of an operator renews the lease, but does not take it over.
+    @routes.public.post("/lease", tags=["access"], response_model=LeaseState, dependencies=schemes(Role.OPERATE))
     def take_lease(body: LeaseBody, person: Watcher) -> Any:
         """Take or renew the lease."""
         require_operate(person)
@@ -153,9 +157,17 @@ def add_jobs(routes: Routes, server: Server) -> None:
         return page.of(server.remote.call("jobs"), "id")
 
     @routes.operate.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
-    def submit_job(body: JobRequest, person: OperatorPerson, response: Response) -> Any:
-        """Add a job to the queue."""
-        job = server.remote.call("submit", request=body, operator=person.name)
+    def submit_job(
+        body: JobRequest, person: OperatorPerson, response: Response, idempotency_key: IdempotencyKey = None
+    ) -> Any:
+        """Add a job to the queue.
+
+        The same request with the same header `Idempotency-Key` returns the job of the first one: repeat it after a lost
+        answer.
+        """
+        if isinstance(body, GotoRequest):  # it would fail later, behind the jobs that wait
+            check_angle(body.angle_deg, server.setup.config.table.limits_deg)
+        job = server.remote.call("submit", request=body, operator=person.name, key=idempotency_key)
         response.headers["Location"] = f"{API}/jobs/{job['id']}"
         return job
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
 from rig.core.clock import Clock
-from rig.core.errors import JobNotFound, JobRejected, ObjectExists, RigError, StateNotStored, os_errors_as
+from rig.core.errors import JobNotFound, JobRejected, ObjectExists, RigError, StateNotStored, UsageError, os_errors_as
 from rig.core.files import read, write
 from rig.core.next_steps import Do, NextStep
 from rig.plans.operator import Choice
@@ -68,13 +68,21 @@ class JobQueue:
         with self._lock:
             return self._find(job_id).model_copy()
 
-    def submit(self, request: JobRequest, operator: str) -> Job:
-        """Add a job to the queue and return it.
+    def submit(self, request: JobRequest, operator: str, key: str | None = None) -> Job:
+        """Add a job to the queue and return it; if the operator has submitted it with this ``key``, return that job.
 
-        Raises `JobRejected`: too many jobs wait, or too large ones.
+        Raises `JobRejected`: too many jobs wait, or too large ones. `UsageError`: the key was that of another request.
         """
         with self._lock:
             self.heed_stops()
+            if key is not None and (earlier := self._submitted(operator, key)):
+                if earlier.request != request:
+                    raise UsageError(
+                        "This Idempotency-Key was used for another request.",
+                        next_step="Use a new key for each request, and the same one only to repeat it.",
+                        evidence={"job": earlier.id},
+                    )
+                return earlier.model_copy()
             waiting = self._waiting()
             size = len(request.model_dump_json()) + sum(len(self._texts[job.id]) for job in waiting)
             if len(waiting) >= MAX_QUEUED or size > MAX_QUEUED_BYTES:
@@ -89,6 +97,7 @@ class JobQueue:
                 state=JobState.QUEUED,
                 created_utc=self._now(),
                 operator=operator,
+                key=key,
             )
             self._jobs[job.id] = job
             self._store(job)
@@ -207,6 +216,10 @@ class JobQueue:
 
     def _waiting(self) -> list[Job]:
         return [job for job in self._jobs.values() if job.state is JobState.QUEUED]
+
+    def _submitted(self, operator: str, key: str) -> Job | None:
+        """Return the job that an operator has submitted with a key, if it is not dropped."""
+        return next((job for job in self._jobs.values() if (job.operator, job.key) == (operator, key)), None)
 
     def _interrupt(self, *jobs: Job) -> None:
         for job in jobs:

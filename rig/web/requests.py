@@ -171,8 +171,9 @@ class StepsDone(_Request):
 class Job(BaseModel):
     """A job of the bench.
 
-    ``error`` has the fields of an error as ``rig --json`` prints them. ``resume`` is the request that continues the
-    job's work; None if there is nothing to continue. ``result`` is the last important event of the plan.
+    ``key`` is the header ``Idempotency-Key`` of its request. ``error`` has the fields of an error as ``rig --json``
+    prints them. ``resume`` is the request that continues the job's work; None if there is nothing to continue.
+    ``result`` is the last important event of the plan.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -182,6 +183,7 @@ class Job(BaseModel):
     state: JobState
     created_utc: str
     operator: str
+    key: str | None = None
     started_utc: str | None = None
     ended_utc: str | None = None
     progress: StepsDone | None = None

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, TypeVar
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response, Security
 from fastapi.security import APIKeyCookie, HTTPBearer
 from starlette.requests import HTTPConnection
 
@@ -154,11 +154,14 @@ Watcher = Annotated[Person, Depends(watcher)]
 OperatorPerson = Annotated[Person, Depends(operator)]
 
 
-_SCHEMES: Final = (
-    Depends(HTTPBearer(scheme_name="token", description="a token of rig serve --new-token", auto_error=False)),
-    Depends(APIKeyCookie(name=COOKIE, scheme_name="login", description="set by POST /login", auto_error=False)),
-)
-"""For the description of the API only: `Server.person` also knows who needs neither, and the errors."""
+def schemes(role: Role) -> list[Any]:
+    """Return what describes in the document of the API how to log in, and the role that is needed.
+
+    It checks nothing: `Server.person` also knows who needs no login, and the errors.
+    """
+    token = HTTPBearer(scheme_name="token", description="a token of rig serve --new-token", auto_error=False)
+    login = APIKeyCookie(name=COOKIE, scheme_name="login", description="set by POST /login", auto_error=False)
+    return [Security(scheme, scopes=[role.value]) for scheme in (token, login)]
 
 
 class Routes:
@@ -166,8 +169,8 @@ class Routes:
 
     def __init__(self) -> None:
         self.public = APIRouter()
-        self.watch = APIRouter(dependencies=[Depends(watcher), *_SCHEMES])
-        self.operate = APIRouter(dependencies=[Depends(operator), *_SCHEMES])
+        self.watch = APIRouter(dependencies=[Depends(watcher), *schemes(Role.WATCH)])
+        self.operate = APIRouter(dependencies=[Depends(operator), *schemes(Role.OPERATE)])
 
 
 @dataclass(frozen=True, slots=True)

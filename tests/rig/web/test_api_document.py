@@ -48,7 +48,24 @@ def test_each_operation_has_a_plain_name_a_schema_for_its_answer_and_the_right_t
         assert all(content["schema"] for content in answer["content"].values()), one["operationId"]
         assert one["operationId"].isidentifier()
         assert ("security" in one) == (one["operationId"] not in PUBLIC)
+        roles = {role for way in one.get("security", ()) for needed in way.values() for role in needed}
+        assert len(roles) == (one["operationId"] not in PUBLIC)
     assert document["components"]["securitySchemes"].keys() == {"token", "login"}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "role"),
+    [
+        ("post", "/jobs", "operate"),
+        ("post", "/lease", "operate"),
+        ("delete", "/lease", "watch"),
+        ("post", "/stop", "watch"),
+        ("get", "/results", "watch"),
+        ("post", "/results/{result_id}/correct", "operate"),
+    ],
+)
+def test_operation_names_the_role_that_it_needs(document, method, path, role):
+    assert document["paths"][f"/api/v1{path}"][method]["security"] == [{"token": [role]}, {"login": [role]}]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rig.core.errors import JobRejected
+from rig.core.errors import JobRejected, UsageError
 from rig.plans.operator import Choice
 from rig.web.jobs import MAX_BYTES, MAX_QUEUED, MAX_QUEUED_BYTES, STORED_BYTES, JobQueue
 from rig.web.requests import EnrollRequest, HomeRequest, JobQuestion, JobState, TrayObject, TrayRequest
@@ -82,3 +82,14 @@ def test_only_the_answers_that_a_job_offers_are_accepted(queue):
         queue.answer(job.id, Choice.RESTART)
     queue.answer(job.id, Choice.SKIP)
     assert queue.answered(running) is Choice.SKIP
+
+
+def test_repeated_request_with_its_key_is_one_job(tmp_path, queue):
+    first = queue.submit(HomeRequest(), "anna", "k-1")
+    assert queue.submit(HomeRequest(), "anna", "k-1") == first
+    again = JobQueue(tmp_path, VirtualClock(), lambda _job: None)  # also after a restart: the first one was interrupted
+    assert again.submit(HomeRequest(), "anna", "k-1").id == first.id
+    assert again.submit(HomeRequest(), "ben", "k-1").id != first.id
+    assert again.submit(HomeRequest(), "anna").id != again.submit(HomeRequest(), "anna").id
+    with pytest.raises(UsageError, match="another request"):
+        again.submit(EnrollRequest(name="lamp"), "anna", "k-1")

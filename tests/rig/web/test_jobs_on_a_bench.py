@@ -95,6 +95,30 @@ def test_sample_is_not_accepted_for_several_objects(serve):
     assert served.client.get("/api/v1/jobs").json()["items"] == []
 
 
+def test_request_that_can_never_be_carried_out_is_refused_at_once(serve):
+    served = serve()
+    low, high = served.server.setup.config.table.limits_deg
+    for angle_deg in (low - 1, high + 1):
+        answer = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": angle_deg})
+        assert (answer.status_code, answer.json()["code"]) == (409, 500)
+        assert answer.json()["evidence"] == {"to_deg": angle_deg, "limits_deg": [low, high]}
+    assert served.client.get("/api/v1/jobs").json()["items"] == []
+
+
+def test_key_of_a_request_makes_its_repetition_harmless(serve):
+    served = serve()
+
+    def submitted(angle_deg: float) -> Any:
+        headers = {"Idempotency-Key": "cell-7"}
+        return served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": angle_deg}, headers=headers)
+
+    first, again, other = submitted(10.0), submitted(10.0), submitted(20.0)
+    assert (first.status_code, again.status_code, other.status_code) == (201, 201, 422)
+    assert first.headers["location"] == again.headers["location"]
+    assert other.json()["evidence"] == {"job": first.json()["id"]}
+    assert served.client.get("/api/v1/jobs").json()["total"] == 1
+
+
 def test_stop_in_a_motion_stops_the_table_and_cancels_all_jobs(serve, halted):
     served = serve()
     first = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
