@@ -194,7 +194,7 @@ def add_jobs(routes: Routes, server: Server) -> None:
     @routes.operate.post("/jobs/{job_id}/answer", tags=["jobs"], response_model=Job)
     def answer_job(job_id: str, body: AnswerBody) -> Any:
         """Answer the question of a job."""
-        return server.remote.call("answer", job_id=job_id, choice=body.choice)
+        return server.remote.call("answer", job_id=job_id, choice=body.choice, sample=body.sample)
 
     @routes.watch.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Jpeg)
     def get_job_view(job_id: str, number: int) -> Jpeg:

@@ -10,6 +10,7 @@ from typing import Final
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
+from rig.catalog.results import clean_text
 from rig.core.clock import Clock
 from rig.core.errors import JobNotFound, JobRejected, ObjectExists, RigError, StateNotStored, UsageError, os_errors_as
 from rig.core.files import read, write
@@ -50,7 +51,7 @@ class JobQueue:
         self._jobs: dict[str, Job] = {}
         self._cancelled: set[str] = set()
         self._pausing: set[str] = set()
-        self._answers: dict[str, Choice] = {}
+        self._answers: dict[str, tuple[Choice, str | None]] = {}
         self._texts: dict[str, str] = {}
         self._stops = stops
         self.heeded = stops()
@@ -149,14 +150,19 @@ class JobQueue:
             self._pausing.discard(job_id)
             return job.model_copy()
 
-    def answer(self, job_id: str, choice: Choice) -> Job:
-        """Answer the question of a job. Raises `JobNotFound`, `JobRejected`."""
+    def answer(self, job_id: str, choice: Choice, sample: str | None = None) -> Job:
+        """Answer the question of a job; ``sample`` if it asks for one.
+
+        Raises `JobNotFound`, `JobRejected`. `UsageError`: the sample cannot be recorded.
+        """
         with self._lock:
             job = self._unended(job_id)
             if job.question is None or choice not in job.question.choices:
                 asked = "asks nothing" if job.question is None else f"takes {', '.join(job.question.choices)}"
                 raise JobRejected(f"The job {asked}.", next_step="Load the job again and answer its question.")
-            self._answers[job_id] = choice
+            if sample is not None and not job.question.takes_sample:
+                raise JobRejected("The job does not ask for a sample.", next_step="Answer without a sample.")
+            self._answers[job_id] = choice, None if sample is None else clean_text(sample, "sample")
             return job.model_copy()
 
     # -- for the worker -----------------------------------------------------------------------------------------------
@@ -191,8 +197,8 @@ class JobQueue:
             job.state = JobState.RUNNING if question is None else JobState.WAITING
             self._store(job)
 
-    def answered(self, job: Job) -> Choice | None:
-        """Return the answer to the job's question, once there is one."""
+    def answered(self, job: Job) -> tuple[Choice, str | None] | None:
+        """Return the answer to the job's question, and the sample that it names, once there is one."""
         with self._lock:
             return self._answers.get(job.id)
 

@@ -47,7 +47,7 @@ class TrayRequest(_Request):
 
 
 class IdentifyRequest(_Request):
-    """Identify the object on the table. With ``watch`` there is no ``sample``, because it names one object."""
+    """Identify the object on the table. ``sample`` names one object; with ``watch``, ``scan`` asks for each one."""
 
     kind: Literal["identify"] = "identify"
     max_views: Annotated[int | None, Field(ge=1, le=72, description="default: identify.max_views")] = None
@@ -56,13 +56,14 @@ class IdentifyRequest(_Request):
     sample: Annotated[
         str | None, Field(max_length=100, description="sample on the table, recorded with the answer")
     ] = None
+    scan: bool = Field(False, description="ask for the sample of each object: the answer to the question names it")
 
     @model_validator(mode="after")
     def _sample_of_one_object(self) -> Self:
-        if self.watch and self.sample is not None:
+        if (self.watch or self.scan) and self.sample is not None:
             raise ValueError(
-                "sample names one object, and watch identifies several; leave out one of them. At the terminal, "
-                "rig identify --watch --scan asks for the sample of each object"
+                "sample names one object, but watch identifies several, and scan asks for the sample of each. Leave "
+                "sample out; with scan, the job asks for it"
             )
         return self
 
@@ -135,11 +136,12 @@ JobRequest = Annotated[
 
 
 class JobQuestion(_Request):
-    """What a job asks the operator."""
+    """What a job asks the operator. With ``takes_sample``, the answer may name the sample on the table."""
 
     text: str
     choices: tuple[Choice, ...]
     steps: Annotated[list[str | dict[str, Any]], Field(description="what to do first, as the steps of an error")] = []
+    takes_sample: bool = False
 
 
 class JobState(StrEnum):
@@ -212,9 +214,10 @@ class LeaseBody(_Request):
 
 
 class AnswerBody(_Request):
-    """The answer to the question of a job."""
+    """The answer to the question of a job; without ``sample``, the sample on the table has no name."""
 
-    choice: Choice
+    choice: Choice = Choice.CONTINUE
+    sample: Annotated[str | None, Field(max_length=1000, description="for a question with takes_sample")] = None
 
 
 class ObjectBody(_Request):

@@ -89,16 +89,23 @@ class ServedDesk(Desk):
         return open_or_copy(self.place, SystemClock(), create=create, attempts=self._worker.attempts)
 
     def choose(self, question: Question) -> Choice:
-        queue, job = self._worker.queue, self.job
         steps = steps_as_json(as_steps(question.steps))
-        queue.ask(job, requests.JobQuestion(text=question.text, choices=tuple(question.choices), steps=steps))
-        while (choice := queue.answered(job)) is None:
-            self._worker.wait(job)
-        queue.ask(job, None)
+        choice, _ = self._ask(requests.JobQuestion(text=question.text, choices=tuple(question.choices), steps=steps))
         return choice
 
     def ask_sample(self) -> str | None:
-        return None  # the request names it
+        text = "Scan or type the sample that is on the table."
+        _, sample = self._ask(requests.JobQuestion(text=text, choices=(Choice.CONTINUE,), takes_sample=True))
+        return sample
+
+    def _ask(self, question: requests.JobQuestion) -> tuple[Choice, str | None]:
+        """Show a question, and wait for its answer; a sample only if it asks for one."""
+        queue, job = self._worker.queue, self.job
+        queue.ask(job, question)
+        while (answer := queue.answered(job)) is None:
+            self._worker.wait(job)
+        queue.ask(job, None)
+        return answer
 
     def next_folder(self) -> Path:
         """Return the folder of the job's next saved run."""

@@ -81,7 +81,9 @@ def test_only_the_answers_that_a_job_offers_are_accepted(queue):
     with pytest.raises(JobRejected, match="continue, skip"):
         queue.answer(job.id, Choice.RESTART)
     queue.answer(job.id, Choice.SKIP)
-    assert queue.answered(running) is Choice.SKIP
+    assert queue.answered(running) == (Choice.SKIP, None)
+    with pytest.raises(JobRejected, match="sample"):
+        queue.answer(job.id, Choice.SKIP, "S-1")
 
 
 def test_repeated_request_with_its_key_is_one_job(tmp_path, queue):

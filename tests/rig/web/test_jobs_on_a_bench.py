@@ -91,8 +91,33 @@ def test_sample_is_not_accepted_for_several_objects(serve):
     assert answer.status_code == 422
     (mistake,) = answer.json()["evidence"]["mistakes"]
     assert "sample names one object" in mistake
-    assert "rig identify --watch --scan" in mistake
+    assert "scan" in mistake
     assert served.client.get("/api/v1/jobs").json()["items"] == []
+
+
+def test_each_object_has_the_sample_that_the_answer_to_its_question_names(serve):
+    served = serve("bench.sim.object='mug-white'")
+    for name in ("mug-white", "lamp"):
+        served.run(kind="enroll", name=name, views=4)
+    job = served.client.post("/api/v1/jobs", json={"kind": "identify", "watch": True, "scan": True}).json()
+    answer = f"/api/v1/jobs/{job['id']}/answer"
+
+    def questions() -> list[Any]:
+        sent = [json.loads(one.data) for one in served.server.hub.since(0)[0] if one.kind == "job"]
+        return [one["question"] for one in sent if one["state"] == "waiting"]
+
+    for number, sample in enumerate(["S-1", None, "S-3"], 1):
+        while len(questions()) < number:
+            SystemClock().sleep(0.005)
+        assert questions()[-1]["takes_sample"]
+        assert served.client.post(answer, json={"sample": "\x07"}).status_code == 422
+        assert served.client.post(answer, json={"sample": sample}).status_code == 200
+    while len(questions()) < 4:
+        SystemClock().sleep(0.005)
+    served.client.post(f"/api/v1/jobs/{job['id']}/cancel")
+    assert served.wait(job["id"])["state"] == "cancelled"
+    results = served.client.get("/api/v1/results").json()["items"]
+    assert [one["sample"] for one in results] == ["S-3", None, "S-1"]
 
 
 def test_request_that_can_never_be_carried_out_is_refused_at_once(serve):
