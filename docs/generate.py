@@ -182,7 +182,7 @@ def _type_words(kind: Any) -> str:
 
 def errors_page() -> str:
     """Return a page with every error of the registry."""
-    from rig.core.errors import RigError
+    from rig.core.errors import error_kinds
 
     lines = [
         f"# Error codes\n\n{NOTE}Every error has a code, says what happened, shows the evidence, and gives the next "
@@ -190,12 +190,10 @@ def errors_page() -> str:
         "| code | title | meaning | Python class |",
         "|---|---|---|---|",
     ]
-    kinds: list[type[RigError]] = [RigError]
-    for kind in kinds:  # grows while it is read
-        kinds += [sub for sub in kind.__subclasses__() if sub.__module__ == RigError.__module__]
-    for kind in sorted(set(kinds) - {RigError}, key=lambda kind: kind.code):
+    for kind in error_kinds():
         summary = (kind.__doc__ or "").partition("\n\n")[0]
-        lines.append(f"| {kind.code} | {kind.title} | {_cell(summary)} | `{kind.__name__}` |")
+        anchor = f'<a id="{kind.code}"></a>{kind.code}'
+        lines.append(f"| {anchor} | {kind.title} | {_cell(summary)} | `{kind.__name__}` |")
     return "\n".join([*lines, "", *_next_steps()])
 
 

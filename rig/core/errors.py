@@ -72,6 +72,14 @@ class RigError(Exception):
         }
 
 
+def error_kinds() -> list[type[RigError]]:
+    """Return every kind of error by its code."""
+    found: list[type[RigError]] = [RigError]
+    for kind in found:  # grows while it is read
+        found += [sub for sub in kind.__subclasses__() if sub.__module__ == RigError.__module__]
+    return sorted(set(found), key=lambda kind: kind.code)
+
+
 @contextmanager
 def os_errors_as(kind: type[RigError], what: str, *, next_step: SomeSteps) -> Iterator[None]:
     """Raise an `OSError` in the ``with`` block as an error of ``kind``, with the system's reason as evidence."""

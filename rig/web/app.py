@@ -17,7 +17,7 @@ from rig.core.errors import RigError
 from rig.web.api_bench import add_access, add_bench, add_jobs
 from rig.web.api_catalog import add_bundles, add_objects, add_results
 from rig.web.api_records import add_records
-from rig.web.pages import pages
+from rig.web.pages import add_reference, pages
 from rig.web.problems import Problem, ProblemResponse
 from rig.web.requests import JobState
 from rig.web.server import API, Routes, Server, Watcher
@@ -47,6 +47,7 @@ def create_app(server: Server) -> FastAPI:
     for router in (routes.public, routes.watch, routes.operate):
         app.include_router(router, prefix=API, responses=_ERRORS)
     app.include_router(pages(server.setup.bench))
+    add_reference(app)
     app.mount("/static", StaticFiles(packages=[("rig.web", "static"), ("rig.charts", "static")]), name="static")
 
     @app.get("/metrics", include_in_schema=False)

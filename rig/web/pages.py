@@ -4,16 +4,20 @@ A script fills the pages from the REST API, so that pages and integrators use on
 button or link is done at a terminal of the bench's computer; the page then shows its command.
 """
 
+from functools import cache
 from typing import Any, Final
 
-from fastapi import APIRouter
+from fastapi import APIRouter, FastAPI
 from fastapi.responses import HTMLResponse
+from jinja2 import ChainableUndefined
 from markupsafe import Markup
 from pydantic import BaseModel
 
 from rig.charts.compass import dial
+from rig.core.errors import error_kinds
 from rig.core.next_steps import Do
 from rig.core.templates import environment
+from rig.web.problems import ERRORS
 from rig.web.requests import AcknowledgeRequest, DoctorRequest, EmptyTableRequest, ReferenceRequest
 
 PAGES: Final = {
@@ -91,3 +95,25 @@ def pages(bench: str) -> APIRouter:
         return HTMLResponse(templates.get_template("login.html.j2").render(shared))
 
     return router
+
+
+def add_reference(app: FastAPI) -> None:
+    """Add the pages of the API and of the errors, for people who write a program; they need no login and no network.
+
+    Both are made once: the document of the API does not change while the server runs.
+    """
+    # The document has no value for each optional key, so a missing one is left out here.
+    template = environment("rig.web", folder="templates").overlay(undefined=ChainableUndefined)
+    show = template.get_template("reference.html.j2").render
+
+    @cache
+    def api() -> str:
+        return show(title="API", errors=ERRORS, document=app.openapi(), source=app.openapi_url)
+
+    @app.get("/reference/api.html", response_class=HTMLResponse, include_in_schema=False)
+    def show_api() -> str:
+        return api()
+
+    @app.get(ERRORS, response_class=HTMLResponse, include_in_schema=False)
+    def show_errors() -> str:
+        return show(title="Errors", errors=ERRORS, kinds=error_kinds())

@@ -21,6 +21,8 @@ _STATUS: Final = {
     errors.CatalogBusy.code: 503,
     errors.TooManyListeners.code: 503,
 }
+ERRORS: Final = "/reference/errors.html"
+"""The page of all errors, with an anchor for each code: in the documentation, and of each server without a network."""
 _BY_HUNDRED: Final = {1: 500, 2: 422, 3: 503, 4: 503, 5: 409, 6: 422, 7: 409, 8: 404, 9: 409}
 """Of the other errors, by the hundreds of their codes."""
 
@@ -30,7 +32,7 @@ def _status(error: RigError) -> int:
 
 
 class Problem(BaseModel):
-    """An error (RFC 9457)."""
+    """An error (RFC 9457). ``type`` is the address of its description, on the server and in the documentation."""
 
     type: str
     title: str
@@ -45,7 +47,7 @@ class Problem(BaseModel):
 def problem(error: RigError) -> dict[str, Any]:
     """Return an error as problem details: ``code``, ``next_step``, ``steps`` and ``evidence`` are extensions."""
     more = {"code": error.code, "evidence": to_jsonable_python(error.evidence, fallback=str)}
-    return _problem(f"urn:hbr-rig:error:{error.code}", error.title, _status(error), error.what, error.steps) | more
+    return _problem(f"{ERRORS}#{error.code}", error.title, _status(error), error.what, error.steps) | more
 
 
 class ProblemResponse(JSONResponse):

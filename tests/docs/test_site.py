@@ -42,7 +42,7 @@ def test_configuration_page_has_every_key(pages):
 
 
 def test_error_page_has_each_code_once(pages):
-    codes = re.findall(r"^\| (\d{3}) \|", pages["reference/errors.md"], re.MULTILINE)
+    codes = re.findall(r'^\| <a id="(\d{3})"></a>\1 \|', pages["reference/errors.md"], re.MULTILINE)
     assert len(codes) == len(set(codes)) > 40
     assert codes == sorted(codes)
 

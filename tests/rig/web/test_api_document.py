@@ -4,6 +4,7 @@
 """
 
 import json
+import re
 import socket
 from dataclasses import fields
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
+from rig.core.errors import error_kinds
 from rig.events.events import Event, event_dict, event_of
 from rig.web.app import create_app
 from rig.web.server import Server
@@ -89,6 +91,19 @@ def test_every_kind_of_event_is_described(document):
     assert "image_bgr" not in accepted
     assert "0° is arbitrary" in accepted["azimuth_deg"]["description"]
     assert {"type": "null"} in schemas["Stillness"]["properties"]["peak_rate_dps"]["anyOf"]
+
+
+def test_reference_of_a_server_shows_each_operation_and_each_error_without_a_network(served, document):
+    page = served.client.get("/reference/api.html").text
+    for methods in document["paths"].values():
+        assert all(f'id="{one["operationId"]}"' in page for one in methods.values())
+    assert set(re.findall('href="#([^"]+)"', page)) <= set(re.findall('id="([^"]+)"', page))
+    problem = served.client.get("/api/v1/jobs/none").json()
+    address, _, anchor = problem["type"].partition("#")
+    errors = served.client.get(address).text
+    assert f'<tr id="{anchor}"><td>{problem["code"]}</td>' in errors
+    assert all(f'id="{kind.code}"' in errors for kind in error_kinds())
+    assert not re.search("<script|https?://", page + errors)
 
 
 def test_stream_and_saved_run_send_such_events(serve):
