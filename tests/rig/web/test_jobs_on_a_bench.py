@@ -120,7 +120,7 @@ def test_each_object_has_the_sample_that_the_answer_to_its_question_names(serve)
     assert [one["sample"] for one in results] == ["S-3", None, "S-1"]
 
 
-def test_request_that_can_never_be_carried_out_is_refused_at_once(serve):
+def test_request_that_can_never_be_carried_out_is_rejected_at_once(serve):
     served = serve()
     low, high = served.server.setup.config.table.limits_deg
     for angle_deg in (low - 1, high + 1):
