@@ -9,7 +9,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Discriminator, GetJsonSchemaHandler, PlainSerializer, RootModel
 from pydantic_core import CoreSchema
 
-from rig.catalog.records import EnrollmentStatus
+from rig.catalog.records import EnrollmentStatus, RecordedOutcome
 from rig.events.events import DESCRIBED, Event, JsonEvent
 from rig.web.access import Role
 
@@ -127,6 +127,34 @@ class ObjectWithViews(ObjectRow):
     enrollments: list[EnrollmentRow]
     views_taken: list[ViewRow]
     similar: dict[str, Any] | None
+
+
+class CorrectionRow(BaseModel):
+    """A correction of an answer, with the values after it."""
+
+    time_utc: Time
+    operator: str
+    outcome: RecordedOutcome
+    object: str | None
+    sample: str | None
+    reason: str
+
+
+class ResultDetails(BaseModel):
+    """A recorded answer, with the fields of a row of ``/results``.
+
+    ``object``, ``outcome`` and ``sample`` are those after the last of the ``history`` of corrections, which is oldest
+    first. ``answer`` is the event `identified` as it was recorded, with the probability ``not_enrolled``.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    result: int
+    outcome: RecordedOutcome
+    object: str | None
+    sample: str | None
+    answer: dict[str, Any]
+    history: list[CorrectionRow]
 
 
 class Deleted(BaseModel):

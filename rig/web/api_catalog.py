@@ -26,6 +26,7 @@ from rig.plans.enroll import similar_objects
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
 from rig.web.answers import (
     Bundle,
+    CorrectionRow,
     Deleted,
     EnrollmentRow,
     Jpeg,
@@ -33,6 +34,7 @@ from rig.web.answers import (
     ListOf,
     ObjectRow,
     ObjectWithViews,
+    ResultDetails,
     ViewRow,
     time_text,
 )
@@ -164,10 +166,22 @@ def add_results(routes: Routes, server: Server) -> None:
         return page.of(rows[::-1], "id")
 
     @routes.watch.get("/results/{result_id}", tags=["results"])
-    def get_result(result_id: Number) -> dict[str, Any]:
-        """Return a recorded answer. The image of its first view is at ``image``, if one was recorded."""
+    def get_result(result_id: Number) -> ResultDetails:
+        """Return a recorded answer with its corrections; ``/results/{result_id}/image`` has its first view."""
         with server.catalog.open_to_read() as catalog:
-            return plain_row(_result(catalog, result_id).as_row())
+            found = _result(catalog, result_id)
+        history = [
+            CorrectionRow(
+                time_utc=one.time_utc,
+                operator=one.operator,
+                outcome=one.corrected.outcome,
+                object=one.corrected.object_name,
+                sample=one.corrected.sample,
+                reason=one.reason,
+            )
+            for one in found.corrections
+        ]
+        return ResultDetails(**plain_row(found.as_row()), answer=found.details, history=history)
 
     @routes.watch.get("/results/{result_id}/image", tags=["results"], response_class=Jpeg)
     def get_result_image(request: Request, result_id: Number, full: Full = False) -> Response:

@@ -76,7 +76,10 @@ def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     fixed = {"object": "lamp", "reason": "read the label"}
     assert served.client.post(f"/api/v1/results/{answer['id']}/correct", json=fixed).json()["object"] == "lamp"
     assert served.client.get("/api/v1/results?object=mug-white").json()["total"] == 0
-    assert served.client.get(f"/api/v1/results/{answer['id']}").json()["object"] == "lamp"
+    details = served.client.get(f"/api/v1/results/{answer['id']}").json()
+    assert (details["object"], details["answer"]["name"]) == ("lamp", "mug-white")
+    assert details["answer"]["not_enrolled"] < 0.5
+    assert [(one["object"], one["reason"]) for one in details["history"]] == [("lamp", "read the label")]
     image = served.client.get(f"/api/v1/results/{answer['id']}/image")
     assert image.headers["content-type"] == "image/jpeg"
     assert image.content.startswith(b"\xff\xd8")
