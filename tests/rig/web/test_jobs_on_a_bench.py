@@ -129,6 +129,7 @@ def test_request_that_can_never_be_carried_out_is_rejected_at_once(serve):
     for angle_deg in (low - 1, high + 1):
         answer = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": angle_deg})
         assert (answer.status_code, answer.json()["code"]) == (409, 500)
+        assert "within" in answer.json()["next_step"]
         assert answer.json()["evidence"] == {"to_deg": angle_deg, "limits_deg": [low, high]}
     assert served.client.get("/api/v1/jobs").json()["items"] == []
 
