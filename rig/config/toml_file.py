@@ -1,17 +1,17 @@
 """Edits single values of `rig.toml`; comments, order and spacing stay.
 
-`tomllib` parses; this module only finds the lines of a value, also by `tomllib`. Each edit is parsed again and rejected
-if it changed anything else. tomlkit is not used, because it drops the comments inside a value of several lines, does
-not put a new key below its commented default, and reports no line numbers.
+An edit replaces or inserts one line ``key = value`` below the header of its table. `tomllib` reads the result, and an
+edit that changed anything else is rejected: values of several lines, inline tables and dotted keys are for people.
+tomlkit is not used, because it does not put a new key below its commented default, and reports no line numbers.
 """
 
 import difflib
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any, Final
@@ -30,15 +30,12 @@ MAX_DOTS: Final = 1000
 MAX_INTEGER: Final = 2**63
 """TOML 1.0, Integer: 64-bit signed."""
 
-MAX_TRIES: Final = 100
-"""Lines of one value at which it may end: each is tried, and a try takes as long as the value."""
-
 NONE: Final = "none"
 """The text that clears an optional key; TOML has no null."""
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-_LAST_LINE = re.compile(r"""(?:[]}]|"{3}|'{3})\s*(?:#.*)?$""")
-"""Matches the last line of each value of several lines, and few others."""
+_HEADER = re.compile(r"\s*\[([^\[\]]+)\]\s*(#.*)?")
+_ASSIGNED = re.compile(r"\s*([^\s#=\[][^#=]*?)\s*=")
 
 
 def loads(text: str) -> dict[str, Any]:
@@ -65,8 +62,16 @@ def loads(text: str) -> dict[str, Any]:
 
 
 def line_numbers(text: str) -> dict[Key, int]:
-    """Return the line of each key and table of a valid document. Raises `ValueError`: see `MAX_TRIES`."""
-    return {statement.key: statement.begin + 1 for statement in _statements(StringIO(text).readlines())}
+    """Return the line of each key and table, for messages. A text of several lines may hold what looks like one."""
+    found: dict[Key, int] = {}
+    table: Key = ()
+    for number, line in enumerate(StringIO(text), 1):
+        if header := _HEADER.fullmatch(line.rstrip()):
+            table = _parts(header[1])
+            found.setdefault(table, number)
+        elif assigned := _ASSIGNED.match(line):
+            found.setdefault((*table, *_parts(assigned[1])), number)
+    return found
 
 
 def with_values(text: str, changes: Mapping[Key, Any]) -> str:
@@ -92,7 +97,7 @@ def with_values(text: str, changes: Mapping[Key, Any]) -> str:
             continue
         here[key[-1]] = value
         try:
-            edited = _edited(text, key, value, before)
+            edited = _edited(text, key, value)
             after = tomllib.loads(edited)
         except ValueError as error:
             raise _cannot_edit(key, value, str(error)) from error
@@ -158,141 +163,49 @@ def stated(key: Key, value: Any) -> str:
     return f"{value:#04x}" if key[-1] == "address" and type(value) is int else toml(value)
 
 
-# -- positions ---------------------------------------------------------------------------------------------------
+def _edited(text: str, key: Key, value: Any) -> str:
+    """Return the document with the line of a key replaced or inserted; the caller checks that it is right."""
+    lines, newline = StringIO(text, newline="").readlines(), "\r\n" if "\r\n" in text else "\n"
+    new = f"{_written(key[-1:])} = {stated(key, value)}"
+    headers = [at for at, line in enumerate(lines) if _HEADER.fullmatch(line.rstrip())]
+    begin = next((at + 1 for at in headers if _table(lines[at]) == key[:-1]), 0 if len(key) == 1 else None)
+    if begin is None:
+        before = "".join(lines)
+        gap = newline * (bool(before) + (bool(before) and not before.endswith("\n")))
+        return f"{before}{gap}[{_written(key[:-1])}]{newline}{new}{newline}"
+    end = next((at for at in headers if at >= begin), len(lines))
+    # Replace the value, and keep its comment.
+    for at in range(begin, end):
+        assigned = _ASSIGNED.match(lines[at])
+        if assigned and _parts(assigned[1]) == key[-1:]:
+            lines[at] = f"{assigned[0]} {stated(key, value)}{_behind_value(lines[at])}"
+            return "".join(lines)
+    # Or insert the key below its commented default, or else below the last line of its table.
+    default = re.compile(rf"\s*#\s*{re.escape(key[-1])}\s*=")
+    last = [at + 1 for at in range(begin, end) if lines[at].strip() and not lines[at].lstrip().startswith("#")]
+    place = next((at + 1 for at in range(begin, end) if default.match(lines[at])), max(last, default=begin))
+    if place and not lines[place - 1].endswith("\n"):
+        lines[place - 1] += newline
+    return "".join([*lines[:place], new, newline, *lines[place:]])
 
 
-@dataclass(frozen=True, slots=True)
-class _Statement:
-    """A ``key = value`` or a ``[table]`` of a document: its lines from ``begin`` to before ``end``.
-
-    ``key`` is the whole path, ``table`` the path of the table above it.
-    """
-
-    key: Key
-    table: Key
-    begin: int
-    end: int
-    is_header: bool = False
+def _table(line: str) -> Key:
+    header = _HEADER.fullmatch(line.rstrip())
+    return _parts(header[1]) if header else ()
 
 
-def _statements(lines: list[str]) -> Iterator[_Statement]:
-    """Yield the statements of a valid document in order, except those inside arrays of tables."""
-    table: Key | None = ()
-    at = 0
-    while at < len(lines):
-        begin, line = at, lines[at].strip()
-        at += 1
-        if line.startswith("[["):
-            table = None
-        elif line.startswith("["):
-            table = _path(tomllib.loads(line))
-            yield _Statement(table, table, begin, at, is_header=True)
-        elif line and not line.startswith("#"):
-            # The lines of a value are those that tomllib can parse.
-            tries = 0
-            while _parsed("".join(lines[begin:at])) is None:
-                at += 1
-                while not _LAST_LINE.search(lines[at - 1]):
-                    at += 1
-                if (tries := tries + 1) > MAX_TRIES:
-                    raise ValueError(f"the value in line {begin + 1} has too many lines that end with a bracket")
-            if table is not None:
-                yield _Statement((*table, *_key_of(lines[begin])[0]), table, begin, at)
-
-
-def _parsed(text: str) -> dict[str, Any] | None:
-    """Return the values of a part of a document; None if it is not complete."""
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        return None
-
-
-def _path(values: Any) -> Key:
-    """Return the only path in the values of a header or a key."""
-    parts = []
-    while isinstance(values, dict) and values:
-        ((part, values),) = values.items()
-        parts.append(part)
-    return tuple(parts)
-
-
-def _key_of(line: str) -> tuple[Key, str]:
-    """Return the path of the key of a line, and the text up to its equals sign, which is not in a quoted key."""
-    for sign in re.finditer("=", line):
-        if (values := _parsed(f"{line[: sign.start()]}= 0")) is not None:
-            return _path(values), line[: sign.end()]
-    raise AssertionError(line)  # the document is valid
+def _parts(words: str) -> Key:
+    """Return the parts of a key; one that contains a dot in quotes is not a key of the rig."""
+    return tuple(part.strip().strip("\"'") for part in words.split("."))
 
 
 def _behind_value(line: str) -> str:
-    """Return what follows the value of a line: its comment and its end."""
-    ends = (hash_sign.start() for hash_sign in re.finditer("#", line))
-    code = next((line[:end] for end in ends if _parsed(line[:end]) is not None), line)
-    return line[len(code.rstrip()) :]
-
-
-def _edited(text: str, key: Key, value: Any, values: Mapping[str, Any]) -> str:
-    lines, newline = StringIO(text).readlines(), "\r\n" if "\r\n" in text else "\n"
-    known = list(_statements(lines))
-    # Replace the value, or that of the inline table around it.
-    for one in (one for one in known if not one.is_header and one.key == key[: len(one.key)]):
-        _, before = _key_of(lines[one.begin])
-        new = f"{before} {stated(one.key, _merged(values, one.key, key[len(one.key) :], value))}"
-        if one.end - one.begin == 1:
-            lines[one.begin] = new + _behind_value(lines[one.begin])
-        else:  # the old lines stay as comments, because there may be comments in them
-            old = [f"#{line.rstrip()}{newline}" for line in lines[one.begin : one.end]]
-            lines[one.begin : one.end] = [*old, new + newline]
-        return "".join(lines)
-    # Or insert the key: below its commented default, below its last sibling, or below the header of its table.
-    siblings = [one for one in known if not one.is_header and one.key[:-1] == key[:-1]]
-    near = (siblings or [one for one in known if one.is_header and one.key == key[:-1]])[-1:]
-    if near:
-        first = lines[near[0].begin]
-        indent = first[: len(first) - len(first.lstrip(" \t"))] if siblings else ""
-        at = _default_line(lines, near[0], key, known) or near[0].end
-        new = f"{indent}{_written(key[len(near[0].table) :])} = {stated(key, value)}{newline}"
-        return _inserted(lines, at, newline, new)
-    line = f"{_written(key[-1:])} = {stated(key, value)}{newline}"
-    if len(key) > 1:
-        return _inserted(
-            lines, len(lines), newline, *[newline] * bool(text.strip()), f"[{_written(key[:-1])}]{newline}", line
-        )
-    # The first key without a table: above the first table and its comments.
-    at = next((one.begin for one in known if one.is_header), len(lines))
-    gap = [newline] * (at < len(lines))
-    while at and lines[at - 1].lstrip(" \t").startswith("#"):
-        at -= 1
-    return _inserted(lines, at, newline, line, *gap)
-
-
-def _merged(values: Mapping[str, Any], table: Key, rest: Key, value: Any) -> Any:
-    """Return the inline table ``table`` with ``rest`` in it set to ``value``; ``value`` if ``rest`` is empty."""
-    if not rest:
-        return value
-    inline: Any = values
-    for part in table:
-        inline = inline[part]
-    inline = here = deepcopy(inline)
-    for part in rest[:-1]:
-        here = here.setdefault(part, {})
-    here[rest[-1]] = value
-    return inline
-
-
-def _default_line(lines: list[str], near: _Statement, key: Key, known: Iterable[_Statement]) -> int | None:
-    """Return the place below the key's commented default (``# key = default``) in the same table, if any."""
-    headers = [one for one in known if one.is_header]
-    begin = max((one.end for one in headers if one.begin <= near.begin), default=0)
-    end = min((one.begin for one in headers if one.begin > near.begin), default=len(lines))
-    default = re.compile(rf"[ \t]*#[ \t]*{re.escape(key[-1])}[ \t]*=")
-    return next((at + 1 for at in range(begin, end) if default.match(lines[at])), None)
-
-
-def _inserted(lines: list[str], at: int, newline: str, *new: str) -> str:
-    before = "".join(lines[:at])
-    return before + newline * (bool(before) and not before.endswith("\n")) + "".join((*new, *lines[at:]))
+    """Return what follows the value of a line: its comment and its end. Raises `ValueError`: it goes on below."""
+    for end in (*(sign.start() for sign in re.finditer("#", line)), len(line)):
+        with suppress(tomllib.TOMLDecodeError):
+            tomllib.loads(line[:end])
+            return line[len(line[:end].rstrip()) :]
+    raise ValueError("its value has several lines")
 
 
 def _written(key: Key) -> str:
