@@ -123,9 +123,10 @@ def set_(
 
     Example: rig config set servo.port /dev/ttyUSB1
     """
-    from rig.config import RigConfig, load_config
+    from rig.bench import check_config
+    from rig.config import RigConfig
     from rig.config.toml_file import changed_lines, read_text, save, with_values
-    from rig.config.values import FILE_NAME, default_path, parsed
+    from rig.config.values import FILE_NAME, default_path, parsed, read_values
     from rig.config.wording import key_info
 
     target = settings.config or default_path() or Path(FILE_NAME)
@@ -136,7 +137,8 @@ def set_(
             next_step=("Write SECTION.KEY. For example,", Do.SET_KEY(key="servo.id", value=2)),
         )
     try:
-        load_config(target if target.exists() else None, [*settings.overrides, f"{key}={value}"])
+        overrides = [*settings.overrides, f"{key}={value}"]
+        check_config(read_values(target if target.exists() else None, overrides))
     except ConfigError as error:
         mistakes = [mistake.removeprefix("--set: ") for mistake in error.evidence.get("mistakes", ())]
         raise ConfigError(

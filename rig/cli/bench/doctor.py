@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import wrap
-from typing import TYPE_CHECKING, Annotated, Any, Final, TextIO
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from rig.config.toml_file import Key
     from rig.doctor.context import DoctorContext
     from rig.doctor.finding import Finding
+    from rig.jobs.desk import Steps
 
 
 @command
@@ -98,24 +98,32 @@ def still_trace(settings: Settings) -> bytes:
 
 def print_findings(settings: Settings) -> dict[str, Any]:
     """Check the bench, print the findings, and return the result as `--json` prints it."""
-    from rig.cli.ui.present import console
     from rig.config import RigConfig
     from rig.config.values import default_path
-    from rig.doctor.finding import Finding
-    from rig.jobs.desk import JobResult
     from rig.jobs.doctor import check_configuration, examine
 
-    screen = console()
     config, known = check_configuration(settings.load, settings.config or default_path())
     bench = settings.bench or (config or RigConfig()).default_bench
-    found: dict[str, Any] = {}
-    for step in examine(bench, doctor_context(settings, default=config is None), known=known, progress=show_progress):
-        if isinstance(step, Finding) and not settings.json:
+    opened = doctor_context(settings, default=config is None)
+    return _shown(settings, examine(bench, opened, known=known, progress=show_progress))
+
+
+def _shown(settings: Settings, steps: "Steps[None]") -> dict[str, Any]:
+    """Print what a job yields, with --json only its result; return the result."""
+    from rig.cli.ui.present import console
+    from rig.doctor.finding import Finding
+    from rig.jobs.desk import JobResult, Remark
+
+    screen, result = console(), dict[str, Any]()
+    for step in steps:
+        if isinstance(step, JobResult):
+            result = step.values
+            settings.say(step.text, result)
+        elif isinstance(step, Finding) and not settings.json:
             print_finding(screen, step)
-        elif isinstance(step, JobResult):
-            found = step.values
-            settings.say(step.text, found)
-    return found
+        elif isinstance(step, Remark) and not settings.json:
+            print(f"! {step.text}")
+    return result
 
 
 @command
@@ -126,20 +134,9 @@ def find(settings: Settings) -> None:
 
     Example: rig find --bench sim
     """
-    from rig.config.toml_file import with_values
+    from rig.jobs.setup import find as find_devices
 
-    with doctor_context(settings) as context:
-        findings, wanted = _scanned(context, None if settings.json else sys.stdout)
-    if settings.json:
-        settings.print_json(
-            {
-                "findings": [finding.as_dict() for finding in findings],
-                "settings": {".".join(key): value for key, value in wanted.items()},
-            }
-        )
-    elif wanted:
-        print(f"\nFor rig.toml (`rig setup` writes it):\n\n{with_values('', wanted)}", end="")
-    if not wanted:
+    if not _shown(settings, find_devices(doctor_context(settings), show_progress))["settings"]:
         raise typer.Exit(EXIT_DEVICE)
 
 
@@ -152,68 +149,17 @@ def setup(settings: Settings) -> None:
 
     Example: rig setup --bench sim
     """
-    from rig.config import RigConfig, load_config
-    from rig.config.toml_file import read_text, save, stated, with_values
     from rig.config.values import FILE_NAME, default_path
-    from rig.config.wording import blank_file
+    from rig.jobs.setup import set_up
 
     path = settings.config or default_path() or Path(FILE_NAME)
-    there = path.exists()
     # A new file has no settings of the file in force: that may belong to another bench.
-    now = settings if there else replace(settings, config=None, search=False)
-    stored = load_config(path) if there else RigConfig()
-    with doctor_context(now) as context:
-        computer, bench = context.computer, context.bench
-        _, wanted = _scanned(context, sys.stderr if settings.json else sys.stdout)
-    is_named = "port" in stored.servo.model_fields_set
-    if is_named and _PORT in wanted and computer.same_file(wanted[_PORT], stored.servo.port):
-        wanted[_PORT] = stored.servo.port  # keep the configured name
-    if ("imu", "address") in wanted:
-        wanted["imu", "connection"] = "i2c"
-    if computer.simulated:  # the devices in the file are real ones
-        wanted = {key: value for key, value in wanted.items() if key[-1] not in _at(stored, key[:-1]).model_fields_set}
-        if not settings.bench and not settings.json:
-            print("These devices are simulated. For the real bench: rig setup --bench hardware")
-    wanted["default_bench",] = bench
-    changes = {key: value for key, value in wanted.items() if not there or _at(stored, key) != value}
-    new = with_values(read_text(path) if there else blank_file(RigConfig), changes)
-    if changes or not there:
-        save(path, new)
-    lines = [f"  {'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
-    lines.append(f"Wrote {path}." if changes or not there else f"{path} is unchanged.")
-    written = {".".join(key): value for key, value in changes.items()}
-    settings.say("\n".join([*lines, ""]), {"path": path, "written": bool(changes) or not there, "settings": written})
+    now = settings if path.exists() else replace(settings, config=None, search=False)
+    _shown(settings, set_up(path, doctor_context(now), show_progress))
     if code := print_findings(replace(settings))["exit_code"]:  # a copy reads the file again
         raise typer.Exit(code)
 
 
-def _scanned(context: "DoctorContext", out: "TextIO | None") -> "tuple[list[Finding], dict[Key, Any]]":
-    """Search all ports, buses and cameras; return the findings, and the settings of the unambiguous devices."""
-    from rig.cli.ui.present import console
-    from rig.doctor.device_scan import DeviceScan
-    from rig.doctor.examination import run_checks
-
-    context.require_free()
-    scan = DeviceScan()
-    findings = []
-    for finding in run_checks(context, scan.checks, show_progress):
-        findings.append(finding)
-        if out is not None:
-            print_finding(console(stderr=out is sys.stderr), finding)
-    several = [what for what, found in scan.candidates.items() if len(found) > 1]
-    if several and out is not None:
-        print(f"! Several devices could be the {' or the '.join(several)}; name one in the file.", file=out)
-    return findings, scan.settings
-
-
-def _at(config: Any, key: "Key") -> Any:
-    """Return a value of a configuration, or a section of it."""
-    for part in key:
-        config = getattr(config, part)
-    return list(config) if isinstance(config, tuple) else config
-
-
-_PORT: Final = ("servo", "port")
 _TOPIC_WIDTH = 12
 _INDENT = 2 + _TOPIC_WIDTH
 

@@ -114,8 +114,9 @@ class Settings:
 
     def _no_catalog(self, path: Path) -> RigError:
         """Return the error that the bench has no catalog; it names the benches that have one."""
-        from rig.bench import bench_names
+        from rig.bench import bench_kind, bench_names
 
+        bench_kind(self.bench_name)  # a misspelt bench has no catalog either
         others = [name for name in bench_names() if self.load().catalog_place(name).database_file.exists()]
         enroll = Do.ENROLL(bench=self.bench_name)
         return CatalogError(
