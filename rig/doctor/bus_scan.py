@@ -17,8 +17,8 @@ from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import model_of, model_row, obstacle
-from rig.devices.i2c import NO_DEVICE, RESTART_CONTROLLER, STUCK, controller_hangs, unbind_command
-from rig.doctor.finding import Finding, FindingCode, bad
+from rig.devices.i2c import NO_DEVICE, STUCK, controller_hangs, unbind_command
+from rig.doctor.finding import Finding, FindingCode
 
 # a scan of all takes long, so the usual ones come first
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
@@ -238,15 +238,13 @@ def unusable_address(found: FoundImu) -> Finding | None:
         place = {"driver": found.kernel_driver or "(unknown)", "bus": found.bus, "address": found.address}
         command = unbind_command(found.bus.removeprefix("/dev/"), found.address, found.kernel_driver)
         fix = command if found.kernel_driver else "ls -l /sys/bus/i2c/devices/*/driver"
-        return bad("imu", FindingCode.KERNEL_DRIVER, fix, **place)
+        return FindingCode.KERNEL_DRIVER(fix, **place)
     if not found.errno:
         return None
-    fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
     code = FindingCode.I2C_STUCK if found.errno in STUCK else FindingCode.I2C_FAILED
-    if found.hangs:
-        code, fix = FindingCode.I2C_HANGS, RESTART_CONTROLLER
+    code = FindingCode.I2C_HANGS if found.hangs else code
     reason = os.strerror(found.errno)
-    return bad("imu", code, fix, bus=found.bus, address=found.address, reason=reason, errno=found.errno)
+    return code(bus=found.bus, address=found.address, reason=reason, errno=found.errno)
 
 
 def use_another_imu() -> str:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
-from rig.core.next_steps import Do, NextStep, SomeSteps, as_steps
+from rig.core.next_steps import Do, NextStep, SomeSteps
 from rig.devices.camera import CameraLocks
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.v4l2 import choose_mode
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, warning
+from rig.doctor.finding import Finding, FindingCode
 from rig.safety.saved_state import FileStore
 from rig.views.capture import ImageQuality, rejection_text
 
@@ -45,15 +45,12 @@ MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
 
 def camera(context: DoctorContext) -> Iterator[Finding]:
     """Open the camera, lock its settings, and take some frames."""
-    if context.holder is not None:
-        yield warning("camera", FindingCode.NOT_CHECKED, Do.STOP())
-        return
     with closing(open_camera(context)) as source:
         identity = source.identity
         context.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         mode = {"name": identity.name, "width": identity.width, "height": identity.height, "fps": identity.fps}
-        yield fine("camera", FindingCode.CAMERA, **mode)
-        yield fine("camera", FindingCode.TIME_BASE, time_base=source.time_base.value)
+        yield FindingCode.CAMERA(**mode)
+        yield FindingCode.TIME_BASE(time_base=source.time_base.value)
         yield from _mode(context, source)
         yield from _locks(context, source)
         yield from _frames(context, source)
@@ -96,13 +93,11 @@ def _mode(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     if nearest is None:
         usable = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps)
         if usable is not None:
-            fix: SomeSteps = Do.SET_KEY(key="camera.fourcc", value="none")
-            yield warning(
-                "camera", FindingCode.MODE_NOT_OFFERED, fix, wanted=f"{size} ({wanted.fourcc})", nearest=usable
-            )
+            fix = Do.SET_KEY(key="camera.fourcc", value="none")
+            yield FindingCode.MODE_NOT_OFFERED(fix, wanted=f"{size} ({wanted.fourcc})", nearest=usable)
         return
     if (nearest.width, nearest.height) != (wanted.width, wanted.height) or 0 < nearest.fps < 0.9 * wanted.fps:
-        yield warning("camera", FindingCode.MODE_NOT_OFFERED, Do.SETUP(), wanted=size, nearest=nearest)
+        yield FindingCode.MODE_NOT_OFFERED(Do.SETUP(), wanted=size, nearest=nearest)
 
 
 def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
@@ -116,7 +111,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
                 "Views of one object differ if the light changes: keep it constant, or use a camera with this control.",
                 Do.SET_KEY(key=f"camera.{_key(one.setting)}", value="none"),
             )
-        yield warning("camera", FindingCode.SETTING_REJECTED, steps, **found)
+        yield FindingCode.SETTING_REJECTED(steps, **found)
     wanted = context.config.camera
     not_locked = [
         name
@@ -130,7 +125,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         if loose
     ]
     if not_locked:
-        yield warning("camera", FindingCode.NOT_LOCKED, fix, settings=not_locked)
+        yield FindingCode.NOT_LOCKED(fix, settings=not_locked)
     rejected = {_key(one.setting) for one in source.rejected_settings}
     locked = [
         f"{name} {value}"
@@ -138,7 +133,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         if name not in not_locked and _LOCKS[name][0] not in rejected
     ]
     if locked:
-        yield fine("camera", FindingCode.LOCKED, settings=locked)
+        yield FindingCode.LOCKED(settings=locked)
 
 
 def _key(setting: str) -> str:
@@ -154,7 +149,6 @@ def lock_words(locks: CameraLocks) -> dict[str, str]:
 
 def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     clock = context.computer.clock
-    again = ("Unplug the camera, plug it in again, then", Do.DOCTOR())
     frames: list[NDArray[np.uint8]] = []
     times_ns = []
     ages = []
@@ -174,31 +168,25 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     levels = [each.mean_level for each in seen]
     evidence: dict[str, Any] = {"frame_age_ms": 1e3 * max(ages), "frames_per_s": rate, "mean_levels": levels}
     if max(levels) < context.config.view.min_mean:
-        fix: SomeSteps = ("Take the lens cap off and switch the light on, then", Do.DOCTOR())
-        yield bad("camera", FindingCode.BLACK, fix, mean_level=max(levels), **evidence)
+        yield FindingCode.BLACK(mean_level=max(levels), **evidence)
         return
     if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
-        yield bad("camera", FindingCode.CAMERA_FROZEN, again, frames=len(frames), **evidence)
+        yield FindingCode.CAMERA_FROZEN(frames=len(frames), **evidence)
         return
     if max(ages) > MAX_AGE_S:
-        yield warning("camera", FindingCode.LATE_FRAMES, "Try another USB port, or reduce camera.width", **evidence)
+        yield FindingCode.LATE_FRAMES(**evidence)
     elif rate < 0.6 * source.identity.fps:
-        fix = "Try another USB port, or reduce camera.exposure_us or camera.fps"
-        yield warning("camera", FindingCode.FEW_FRAMES, fix, fps=source.identity.fps, **evidence)
+        yield FindingCode.FEW_FRAMES(fps=source.identity.fps, **evidence)
     else:
-        yield fine("camera", FindingCode.FRAMES, **evidence)
+        yield FindingCode.FRAMES(**evidence)
     yield from _flicker(source, frames, np.array(times_ns), evidence)
     # Would an enrollment accept this view?
     quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
-        fix = (
-            "Check light, exposure and focus (an empty table may look blurred). The limits are in [view].",
-            Do.SHOW_CONFIGURATION(),
-        )
         texts = [rejection_text(reason, seen[-1]) for reason in reasons]
-        yield warning("camera", FindingCode.VIEW_REJECTED, fix, reasons=texts, codes=reasons, **quality)
+        yield FindingCode.VIEW_REJECTED(reasons=texts, codes=reasons, **quality)
     else:
-        yield fine("camera", FindingCode.VIEW_ACCEPTED, **quality)
+        yield FindingCode.VIEW_ACCEPTED(**quality)
 
 
 # -- lamps that flicker with the mains: the bands that they leave in the images of a rolling shutter -------------------
@@ -279,17 +267,15 @@ def _flicker(
     reported_us = source.read_locks().exposure_us
     exposure_us = reported_us or 1e4
     if lamp is not None:
-        fix: SomeSteps = _exposure_without_bands(lamp.mains_hz, exposure_us)
-        yield warning("camera", FindingCode.MAINS_FLICKER, fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
+        fix = _exposure_without_bands(lamp.mains_hz, exposure_us)
+        yield FindingCode.MAINS_FLICKER(fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
     elif spread > MAX_FLICKER:
-        fix = ("Use a lamp that does not flicker, and keep daylight and shadows away, then", Do.DOCTOR())
-        yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
+        yield FindingCode.FLICKER(spread=spread, seconds=SPACED * SPACING_S, **evidence)
     else:
         for hz in standing_mains_hz(times_ns):
             if reported_us is None or abs(whole_periods_us(hz, exposure_us) - exposure_us) > EXPOSURE_STEP_US:
-                steps = as_steps(_exposure_without_bands(hz, exposure_us))
-                parameters = {"mains_hz": hz}
-                yield Finding("camera", Severity.FINE, FindingCode.STANDING_FLICKER_NOT_CHECKED, parameters, steps)
+                fix = _exposure_without_bands(hz, exposure_us)
+                yield FindingCode.STANDING_FLICKER_NOT_CHECKED(fix, mains_hz=hz)
 
 
 def _exposure_without_bands(mains_hz: float, exposure_us: float) -> NextStep:

@@ -14,7 +14,7 @@ from rig.doctor import computer
 from rig.doctor.camera import camera
 from rig.doctor.context import DoctorContext
 from rig.doctor.examination import Check
-from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, graded, of_error
 from rig.doctor.imu import imu
 from rig.doctor.servo import servo
 from rig.views.stream import exposed_before_stamp_ns
@@ -30,13 +30,13 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
     place = context.config.catalog_place(context.bench)
     path = place if place.url is not None else place.path
     if not place.may_exist():
-        yield fine("catalog", FindingCode.NO_CATALOG, path=path)
+        yield FindingCode.NO_CATALOG(path=path)
         return
     with Catalog.open(place, clock=context.computer.clock, read_only=True) as opened:
         with opened.database.read() as transaction:
             checked = opened.database.damage(transaction)
         if checked:
-            yield bad("catalog", FindingCode.DATABASE_DAMAGED, Do.VERIFY_CATALOG(), 7, path=path, damage=checked)
+            yield FindingCode.DATABASE_DAMAGED(path=path, damage=checked)
         if (changed := opened.damage()) is not None:
             raise changed
         objects, chosen = opened.objects(), _some_images(opened)
@@ -48,14 +48,13 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
                 broken.append(error)
         if broken:
             found = {"broken": len(broken), "images": len(chosen), "first": broken[0].what}
-            yield bad("catalog", FindingCode.IMAGES_DAMAGED, Do.VERIFY_CATALOG(), 7, **found)
+            yield FindingCode.IMAGES_DAMAGED(**found)
         unfinished = [item.name for item in objects if item.unfinished_views is not None]
         if unfinished:
-            steps = Do.CONTINUE_ENROLLMENT(name=unfinished[0])
-            yield warning("catalog", FindingCode.UNFINISHED, steps, objects=unfinished)
+            yield FindingCode.UNFINISHED(Do.CONTINUE_ENROLLMENT(name=unfinished[0]), objects=unfinished)
         if not checked and not broken:
             counts = {"objects": len(objects), "views": sum(item.views for item in objects), "images": len(chosen)}
-            yield fine("catalog", FindingCode.CATALOG, path=path, **counts)
+            yield FindingCode.CATALOG(path=path, **counts)
 
 
 def _some_images(opened: Catalog) -> list[str]:
@@ -72,7 +71,7 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
     device = apparatus(context.bench, context.identities, context.config, {})
     calibrations = store.on_bench(device, context.computer.clock.utc())
     for error in store.unreadable:
-        yield of_error("calibration", error)
+        yield of_error(error)
     for calibration in calibrations:
         found = {
             "calibration": calibration,
@@ -80,16 +79,13 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
             "status": calibration.status,
             "id": calibration.result.id,
         }
-        recalibrate = calibration.repetition
-        if calibration.status is CalibrationStatus.IN_FORCE:
-            yield fine("calibration", FindingCode.CALIBRATION, **found)
-        else:
-            yield warning("calibration", FindingCode.CALIBRATION, recalibrate, **found)
+        level = graded(bad=False, warning=calibration.status is not CalibrationStatus.IN_FORCE)
+        yield FindingCode.CALIBRATION(calibration.repetition, level, **found)
     yield _camera_delay(context, calibrations)
     for name, without in WANTED.items():
         if name not in {calibration.result.name for calibration in calibrations} and not _configured(context, name):
             fix = Do.CALIBRATE(name=name.partition(".")[0])
-            yield warning("calibration", FindingCode.NEVER_CALIBRATED, fix, name=name, consequence=without)
+            yield FindingCode.NEVER_CALIBRATED(fix, name=name, consequence=without)
 
 
 def _camera_delay(context: DoctorContext, calibrations: Iterable[BenchCalibration]) -> Finding:
@@ -97,11 +93,10 @@ def _camera_delay(context: DoctorContext, calibrations: Iterable[BenchCalibratio
     in_force = (one.result for one in calibrations if one.status is CalibrationStatus.IN_FORCE)
     config, _ = apply_results(context.config, in_force)
     if config.camera_time.offset_ms is None:
-        measure = Do.CALIBRATE(name="camera-time")
-        return Finding("calibration", Severity.FINE, FindingCode.CAMERA_DELAY_UNKNOWN, steps=(measure,))
+        return FindingCode.CAMERA_DELAY_UNKNOWN()
     delay_ms = exposed_before_stamp_ns(config) * 1e-6
     found = config.camera_time.model_dump()
-    return fine("calibration", FindingCode.CAMERA_DELAY, delay_ms=delay_ms, **found)
+    return FindingCode.CAMERA_DELAY(delay_ms=delay_ms, **found)
 
 
 def _configured(context: DoctorContext, key: str) -> bool:
@@ -111,15 +106,15 @@ def _configured(context: DoctorContext, key: str) -> bool:
 
 
 CHECKS = (
-    Check("bench", computer.bench_state),
+    Check("bench", computer.bench_state, exit_code=5),
     Check("port", computer.ports),
     # Between two findings it may scan eight baud rates; a broadcast at 9,600 baud takes four seconds.
-    Check("servo", servo, deadline_s=60.0),
-    Check("imu", imu),
-    Check("camera", camera, deadline_s=20.0),
-    Check("disk", computer.disk),
-    Check("clock", computer.clock),
-    Check("catalog", catalog, deadline_s=30.0),
+    Check("servo", servo, deadline_s=60.0, opens=True),
+    Check("imu", imu, opens=True),
+    Check("camera", camera, deadline_s=20.0, opens=True),
+    Check("disk", computer.disk, exit_code=7),
+    Check("clock", computer.clock, exit_code=1),
+    Check("catalog", catalog, deadline_s=30.0, exit_code=7),
     Check("calibration", calibrations),
 )
 """The devices are checked before their calibrations, which are bound to the devices found."""

@@ -7,7 +7,7 @@ from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.camera_node import camera_node
 from rig.core.next_steps import Do, SomeSteps
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, bad, finding, fine, graded, warning
+from rig.doctor.finding import Finding, FindingCode, graded
 from rig.safety.saved_state import FileStore
 
 LATENCY_MS = 1  # required latency timer of an FTDI adapter; the default is 16, and each reading waits for it
@@ -34,27 +34,15 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
     path = context.config.state_path(context.bench)
     if context.holder is not None:
         who = f"process {context.holder.pid} ({context.holder.command})" if context.holder.pid else "another process"
-        yield warning("bench", FindingCode.BENCH_IN_USE, Do.STOP(), holder=who, pid=context.holder.pid)
+        yield FindingCode.BENCH_IN_USE(holder=who, pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
-        yield bad(
-            "bench",
-            FindingCode.STATE_DAMAGED,
-            (
-                "Check how far the cable is wound up, then",
-                Do.ACKNOWLEDGE(),
-                "If it hangs free,",
-                Do.SET_REVOLUTIONS(revolutions=0),
-                "Otherwise, give the revolutions that it is wound up.",
-            ),
-            5,
-            what=state.fault.what if state.fault else state.damage,
-            damage=state.damage,
-        )
+        what = state.fault.what if state.fault else state.damage
+        yield FindingCode.STATE_DAMAGED(what=what, damage=state.damage)
     elif state.fault is not None:
-        yield bad("bench", FindingCode.FAULT_LATCHED, Do.ACKNOWLEDGE(), 5, **state.fault.as_dict())
+        yield FindingCode.FAULT_LATCHED(**state.fault.as_dict())
     if context.holder is None and not state.damage and state.fault is None:
-        yield fine("bench", FindingCode.BENCH_FREE, bench=context.bench, state=path)
+        yield FindingCode.BENCH_FREE(bench=context.bench, state=path)
 
 
 def ports(context: DoctorContext) -> Iterator[Finding]:
@@ -65,10 +53,10 @@ def ports(context: DoctorContext) -> Iterator[Finding]:
         if port is None:
             yield _missing(context, key, wanted, context.computer.serial_ports())
             continue
-        findings = list(access(context, "port", port, "dialout"))
+        findings = list(access(context, port, "dialout"))
         yield from findings
         if not any(one.fix for one in findings) and context.computer.is_left_to_modem_manager(port):
-            yield warning("port", FindingCode.MODEM_MANAGER, udev_command(context), path=port.path)
+            yield FindingCode.MODEM_MANAGER(udev_command(context), path=port.path)
         if port.latency_ms is not None:
             yield _latency(context, port)
     if not head:
@@ -81,12 +69,12 @@ def _i2c(context: DoctorContext) -> Iterator[Finding]:
     buses = context.computer.i2c_buses(bus)
     node = next((n for n in buses if context.computer.same_file(n.path, bus)), None)
     if node is not None:
-        yield from access(context, "port", node, "i2c")
+        yield from access(context, node, "i2c")
     elif buses:
         fix = Do.SET_KEY(key="imu.bus", value=buses[0].path.removeprefix("/dev/i2c-"))
-        yield bad("port", FindingCode.NO_I2C_BUS, fix, wanted=bus, found=_names(buses))
+        yield FindingCode.NO_I2C_BUS(fix, wanted=bus, found=_names(buses))
     else:
-        yield bad("port", FindingCode.NO_I2C_BUS, i2c_command(context), wanted=bus, found=[])
+        yield FindingCode.NO_I2C_BUS(i2c_command(context), wanted=bus, found=[])
 
 
 def _video(context: DoctorContext) -> Iterator[Finding]:
@@ -96,12 +84,12 @@ def _video(context: DoctorContext) -> Iterator[Finding]:
     cameras = context.computer.cameras()
     node = next((n for n in cameras if context.computer.same_file(n.path, camera)), None)
     if node is not None:
-        yield from access(context, "port", node, "video")
+        yield from access(context, node, "video")
     else:
         fix: SomeSteps = ("Connect the camera, then", Do.FIND())
         if cameras:
             fix = Do.SET_KEY(key="camera.source", value=cameras[0].stable or cameras[0].path)
-        yield bad("port", FindingCode.NO_CAMERA_DEVICE, fix, wanted=camera, found=_names(cameras))
+        yield FindingCode.NO_CAMERA_DEVICE(fix, wanted=camera, found=_names(cameras))
 
 
 def disk(context: DoctorContext) -> Iterator[Finding]:
@@ -111,30 +99,28 @@ def disk(context: DoctorContext) -> Iterator[Finding]:
     views = there.free_bytes // VIEW_BYTES
     free = {"free_gb": there.free_bytes / 1e9, "path": path, "objects": views // context.config.enroll.views}
     level = graded(bad=there.free_bytes < TOO_LITTLE_ROOM, warning=there.free_bytes < LITTLE_ROOM)
-    yield finding(level, "disk", FindingCode.FREE_SPACE, Do.REMOVE_DELETED(), 7, **free)
+    yield FindingCode.FREE_SPACE((), level, **free)
     if not there.writable:
         fix: SomeSteps = (
             f"sudo chown -R {context.computer.user.name} {path}"
             if path.exists()
             else Do.SET_KEY(key="catalog.path", value="FOLDER")
         )
-        yield bad("disk", FindingCode.NOT_WRITABLE, fix, 7, user=context.computer.user.name, path=path)
+        yield FindingCode.NOT_WRITABLE(fix, user=context.computer.user.name, path=path)
     if there.network:
-        fix = Do.SET_KEY(key="catalog.path", value="FOLDER-ON-A-LOCAL-DISK")
-        yield warning("disk", FindingCode.NETWORK_DISK, fix, path=path)
+        yield FindingCode.NETWORK_DISK(path=path)
 
 
 def clock(context: DoctorContext) -> Iterator[Finding]:
     """Check that the civil time is right."""
     now, synchronised = context.computer.clock.utc(), context.computer.time_synchronised()
-    fix = "sudo timedatectl set-ntp true"
     if now < _OLDEST_UTC or now > _OLDEST_UTC + timedelta(days=365 * 50):
-        yield bad("clock", FindingCode.WRONG_DATE, fix, 1, utc=now)
+        yield FindingCode.WRONG_DATE(utc=now)
     elif synchronised:
-        yield fine("clock", FindingCode.SYNCHRONIZED, utc=now)
+        yield FindingCode.SYNCHRONIZED(utc=now)
     else:
         code = FindingCode.NO_TIME_SERVER if synchronised is None else FindingCode.NOT_SYNCHRONIZED
-        yield warning("clock", code, fix, utc=now)
+        yield code(utc=now)
 
 
 def udev_rules(ports_found: list[SerialPort]) -> str:
@@ -187,27 +173,27 @@ def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPo
     match [port for port in found if port.usb]:
         case [] if (program := context.computer.running("brltty")) is not None:
             fix = PORT_GRABBERS["brltty"]
-            return bad("port", FindingCode.BRLTTY_TAKES_PORT, fix, wanted=wanted, pid=program.pid)
+            return FindingCode.BRLTTY_TAKES_PORT(fix, wanted=wanted, pid=program.pid)
         case []:
             fix = ("Plug the adapter in, then", Do.FIND())
         case [one]:
             fix = Do.SET_KEY(key=key, value=one.stable or one.path)
         case _:
             fix = Do.SETUP()
-    return bad("port", FindingCode.NO_SERIAL_PORT, fix, wanted=wanted, found=_names(found))
+    return FindingCode.NO_SERIAL_PORT(fix, wanted=wanted, found=_names(found))
 
 
-def access(context: DoctorContext, topic: str, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
+def access(context: DoctorContext, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
     """Check that a device file can be opened: no other program uses it, and the user has permission."""
     if node.holders and not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
         command = node.holders[0].command
         fix: SomeSteps = next(
             (fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {node.holders[0].pid}"
         )
-        yield bad(topic, FindingCode.DEVICE_FILE_IN_USE, fix, path=node.path, holders=node.holders)
+        yield FindingCode.DEVICE_FILE_IN_USE(fix, path=node.path, holders=node.holders)
         return
     if node.usable:
-        yield fine(topic, FindingCode.DEVICE_FILE, path=node.path, name=node.name, stable=node.stable)
+        yield FindingCode.DEVICE_FILE(path=node.path, name=node.name, stable=node.stable)
         return
     user, group = context.computer.user.name, node.group or usual_group
     if group == "root":
@@ -216,15 +202,15 @@ def access(context: DoctorContext, topic: str, node: DeviceFile, usual_group: st
         code, fix = FindingCode.GROUP_AT_NEXT_LOGIN, f"newgrp {group}"
     else:
         code, fix = FindingCode.NOT_IN_GROUP, f"sudo usermod -aG {group} {user}"
-    yield bad(topic, code, fix, user=user, path=node.path, name=node.name, group=group)
+    yield code(fix, user=user, path=node.path, name=node.name, group=group)
 
 
 def _latency(context: DoctorContext, port: SerialPort) -> Finding:
     now = {"path": port.path, "latency_ms": port.latency_ms}
     if port.latency_ms is None or port.latency_ms <= LATENCY_MS:
-        return fine("port", FindingCode.LATENCY, **now)
+        return FindingCode.LATENCY(**now)
     fix, permanently = f"echo {LATENCY_MS} | sudo tee {port.latency_file}", context.step(Do.UDEV_RULES()).command
-    return warning("port", FindingCode.HIGH_LATENCY, fix, permanently=permanently, **now)
+    return FindingCode.HIGH_LATENCY(fix, permanently=permanently, **now)
 
 
 def _names(nodes: list[DeviceFile] | list[SerialPort]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -13,7 +13,6 @@ from rig.config import CameraConfig
 from rig.config.imus import imu_kind, recognised
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
-from rig.core.next_steps import Do, SomeSteps
 from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
@@ -33,7 +32,7 @@ from rig.doctor.bus_scan import (
 from rig.doctor.computer import access, i2c_command
 from rig.doctor.context import DoctorContext
 from rig.doctor.examination import Check
-from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, Severity, of_error
 from rig.doctor.servo import duplicate_id, foreign_bytes
 
 
@@ -109,14 +108,13 @@ class DeviceScan:
             known = [port for port in known if port.path in self.ports]
         asked = [p for p in known if p.usb or context.computer.same_file(p.path, context.config.servo.port)]
         if not asked:
-            fix = ("Connect the U2D2, then", Do.FIND())
-            yield bad("servo", FindingCode.NO_USB_PORT, fix, found=[port.path for port in known])
+            yield FindingCode.NO_USB_PORT(found=[port.path for port in known])
         for port in asked:
             yield from self._on_port(context, port)
 
     def _on_port(self, context: DoctorContext, port: SerialPort) -> Iterator[Finding | str]:
         """Scan a port for servos, then for a rig head."""
-        if problems := [finding for finding in access(context, "servo", port, "dialout") if finding.fix]:
+        if problems := [finding for finding in access(context, port, "dialout") if finding.fix]:
             yield from problems
             return
         known_head = context.config.imu.connection == "head" and context.computer.same_file(
@@ -126,14 +124,12 @@ class DeviceScan:
             servos = False if known_head else (yield from self._servos(context, port))
             head = False if servos else (yield from self._head(context, port))
         except DeviceNotFound as error:
-            yield of_error("servo", error)
+            yield of_error(error)
         except (serial.SerialException, OSError) as error:
-            fix: SomeSteps = ("Connect the adapter again, then", Do.FIND())
-            yield bad("servo", FindingCode.PORT_FAILED, fix, port=port.path, reason=str(error))
+            yield FindingCode.PORT_FAILED(port=port.path, reason=str(error))
         else:
             if not (servos or head or self.duplicate_ids):
-                fix = ("Check the servo's cable and switch on its supply, then", Do.FIND())
-                yield warning("servo", FindingCode.NOTHING_ON_PORT, fix, port=port.path, name=port.name)
+                yield FindingCode.NOTHING_ON_PORT(port=port.path, name=port.name)
 
     def _servos(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
         with closing(context.computer.open_serial(port.path, BAUD_RATES[0])) as wire:
@@ -160,11 +156,11 @@ class DeviceScan:
             other = recognised(imu.address, imu_kind(imu.model).register, error.evidence.get("got", -1))
             if model is None and other is not None and other.driver:
                 return (yield from self._head(context, port, other.key))
-            yield of_error("imu", error)
+            yield replace(of_error(error), topic="imu")
             return True
         self.heads.append((port, imu.model))
         parts = {"model": who.model, "board": who.board, "firmware": who.firmware}
-        yield fine("imu", FindingCode.HEAD, port=port.path, **parts)
+        yield replace(FindingCode.HEAD(port=port.path, **parts), topic="imu")
         return True
 
     def _found(self, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
@@ -172,10 +168,10 @@ class DeviceScan:
             place = {"port": port.path, "id": found.bus_id, "baud": found.baud}
             if found.obstacle:
                 reason, fix = found.obstacle
-                yield warning("servo", FindingCode.SERVO_NOT_DRIVEN, fix, found=found, reason=reason, **place)
+                yield FindingCode.SERVO_NOT_DRIVEN(fix, found=found, reason=reason, **place)
                 continue
             self.servos.append((port, found))
-            yield fine("servo", FindingCode.SERVO_FOUND, found=found, **place)
+            yield FindingCode.SERVO_FOUND(found=found, **place)
         if scan.duplicate_ids:
             self.duplicate_ids = True
             yield duplicate_id(port.path, scan)
@@ -187,14 +183,14 @@ class DeviceScan:
         before = len(self.imus)
         for node in context.computer.i2c_buses(context.config.imu.bus):
             asked += 1
-            if problems := [finding for finding in access(context, "imu", node, "i2c") if finding.fix]:
+            if problems := [finding for finding in access(context, node, "i2c") if finding.fix]:
                 yield from problems
                 continue
             yield f"{node.path}: searching for IMUs ..."
             try:
                 there = scan_imus(context.computer, node.path)
             except OSError as error:
-                yield bad("imu", FindingCode.I2C_NOT_OPENED, Do.FIND(), bus=node.path, reason=error.strerror)
+                yield FindingCode.I2C_NOT_OPENED(bus=node.path, reason=error.strerror)
                 continue
             failures = {found.errno for found in there if found.errno}
             for found in there:
@@ -204,15 +200,14 @@ class DeviceScan:
                     failures.discard(found.errno)
                 elif found.driver:
                     self.imus.append(found)
-                    yield fine("imu", FindingCode.IMU_FOUND, found=found, bus=found.bus, address=found.address)
+                    yield FindingCode.IMU_FOUND(found=found, bus=found.bus, address=found.address)
                 else:
-                    fix: SomeSteps = use_another_imu()
-                    yield warning("imu", FindingCode.NO_DRIVER, fix, found=found, address=found.address)
+                    level = Severity.WARNING
+                    yield FindingCode.NO_DRIVER(use_another_imu(), level, found=found, address=found.address)
         if not asked and not self.heads:
-            yield bad("imu", FindingCode.NO_I2C, i2c_command(context))
+            yield FindingCode.NO_I2C(i2c_command(context))
         elif len(self.imus) == before and not self.heads:
-            fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
-            yield warning("imu", FindingCode.NO_IMU_FOUND, fix)
+            yield FindingCode.NO_IMU_FOUND()
 
     def find_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
         nodes = context.computer.cameras()
@@ -221,23 +216,23 @@ class DeviceScan:
             self.ribbons.append(number)
             yield ribbon_camera(name, number)
         if not nodes and not ribbons:
-            yield warning("camera", FindingCode.NO_CAMERA, ("Connect the camera, then", Do.FIND()))
+            yield FindingCode.NO_CAMERA()
         for node in nodes:
-            if problems := [finding for finding in access(context, "camera", node, "video") if finding.fix]:
+            if problems := [finding for finding in access(context, node, "video") if finding.fix]:
                 yield from problems
                 continue
             yield f"{node.path}: opening ..."
             try:
                 capture = context.computer.open_capture(node.path)
             except DeviceNotFound as error:
-                yield of_error("camera", error)
+                yield of_error(error)
                 continue
             width, height = (round(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
             found = FoundCamera(node, width, height, capture.get(cv2.CAP_PROP_FPS), modes_of(capture))
             capture.release()
             self.cameras.append(found)
             mode = {"path": node.path, "width": width, "height": height, "fps": found.fps}
-            yield fine("camera", FindingCode.CAMERA, name=f"{node.path}: {node.name}", **mode)
+            yield FindingCode.CAMERA(name=f"{node.path}: {node.name}", **mode)
 
 
 def ribbon_camera(name: str, number: int) -> Finding:
@@ -247,8 +242,8 @@ def ribbon_camera(name: str, number: int) -> Finding:
         import_picamera2()
     except DeviceNotFound as error:
         parameters = place | {"what": error.what.rstrip("."), **error.evidence}
-        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, error.steps, **parameters)
-    return fine("camera", FindingCode.RIBBON_CAMERA, **place)
+        return FindingCode.RIBBON_CAMERA_UNREACHABLE(error.steps, **parameters)
+    return FindingCode.RIBBON_CAMERA(**place)
 
 
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:

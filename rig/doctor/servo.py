@@ -20,29 +20,25 @@ from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
 from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, bad, finding, fine, graded, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, Severity, graded, of_error
 
 READS = 100  # finds one bad reading in fifty; takes half a second at 57,600 bit/s
 REPEATED = 2  # number of repeated readings on a good bus
 SLOW = 1 / 3  # share of the control loop's period that a reading may take; the usual cause of more is the latency timer
 IMPOSSIBLE_C = 150
-POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then"
 
 
 def servo(context: DoctorContext) -> Iterator[Finding | str]:
     """Find the configured servo and others on its bus, and check its settings, supply and temperature."""
-    if context.holder is not None:
-        yield warning("servo", FindingCode.NOT_CHECKED, Do.STOP())
-        return
     config = context.config.servo
     if context.config.imu.connection == "head" and context.config.head.power:
-        yield warning("servo", FindingCode.SUPPLY_SWITCHED, Do.STATUS())
+        yield FindingCode.SUPPLY_SWITCHED()
         return
     with ExitStack() as opened:
         try:
             wire = context.computer.open_serial(config.port, config.baud)
         except DeviceNotFound as error:
-            yield of_error("servo", error)
+            yield of_error(error)
             return
         opened.callback(wire.close)
         plugged = servo_plugin(config.model)
@@ -50,21 +46,21 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
         try:
             found = open_servo(wire, config, context.computer.clock, context.config.table.mode)
         except DeviceNotFound as error:
-            yield from [of_error("servo", error)] if foreign else _scan_rates(context, wire)
+            yield from [of_error(error)] if foreign else _scan_rates(context, wire)
             return
         except DeviceMismatch as error:
             number = error.evidence.get("model_number")  # another maker's driver may not report it
             model = None if number is None or obstacle(number) else model_of(number)
-            yield of_error("servo", error, Do.SET_KEY(key="servo.model", value=model) if model else "")
+            yield of_error(error, Do.SET_KEY(key="servo.model", value=model) if model else "")
             return
         except DeviceSilent as error:
             yield from () if foreign else _others_on_bus(context, wire)
-            yield of_error("servo", error)
+            yield of_error(error)
             return
         identity = found.identity
         context.identities["servo"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         name = identity.model.replace("_", "-").upper()
-        yield fine("servo", FindingCode.SERVO, model=name, firmware=identity.firmware, **_place(config))
+        yield FindingCode.SERVO(model=name, firmware=identity.firmware, **_place(config))
         if isinstance(found, DynamixelServo):
             yield from _others_on_bus(context, wire)
             yield from _settings(found)
@@ -83,10 +79,10 @@ def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Find
         return
     there = [found for scan in without_echoes(answered, config.baud) for found in scan.servos]
     if not there:
-        yield bad("servo", FindingCode.NO_SERVO, (POWER, Do.DOCTOR()), **_place(config))
+        yield FindingCode.NO_SERVO(**_place(config))
         return
     fix = Do.SETUP() if len(there) > 1 else _use(config, there[0])
-    yield bad("servo", FindingCode.OTHER_SERVOS, fix, found=there, **_place(config))
+    yield FindingCode.OTHER_SERVOS(fix, found=there, **_place(config))
 
 
 def _place(config: ServoConfig) -> dict[str, Any]:
@@ -116,9 +112,9 @@ def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[F
         elif scan.noise:
             yield foreign_bytes(config.port, scan)
         elif others:
-            yield fine("servo", FindingCode.MORE_SERVOS, found=others)
+            yield FindingCode.MORE_SERVOS(found=others)
         else:
-            yield fine("servo", FindingCode.ONLY_SERVO)
+            yield FindingCode.ONLY_SERVO()
 
 
 def duplicate_id(port: str, scan: BaudScan) -> Finding:
@@ -126,49 +122,44 @@ def duplicate_id(port: str, scan: BaudScan) -> Finding:
     taken = {servo.bus_id for servo in scan.servos} | set(scan.duplicate_ids)
     free_id = next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
     fix = ("Unplug one of the two, then", Do.SERVO_ID(id=free_id))
-    return bad("servo", FindingCode.DUPLICATE_ID, fix, port=port, ids=scan.duplicate_ids, baud=scan.baud)
+    return FindingCode.DUPLICATE_ID(fix, port=port, ids=scan.duplicate_ids, baud=scan.baud)
 
 
 def foreign_bytes(port: str, scan: BaudScan) -> Finding:
     """Return the finding that bytes of no servo arrive."""
-    fix = ("Remove everything but servos from the bus, then", Do.DOCTOR())
-    return warning("servo", FindingCode.FOREIGN_BYTES, fix, port=port, baud=scan.baud)
+    return FindingCode.FOREIGN_BYTES(port=port, baud=scan.baud)
 
 
 def _settings(found: DynamixelServo) -> Iterator[Finding]:
     differences = found.setting_differences()
     if not differences:
-        yield fine("servo", FindingCode.SETTINGS_CORRECT)
+        yield FindingCode.SETTINGS_CORRECT()
     for difference in differences:
         values = {"register": difference.register, "found": difference.found, "wanted": difference.wanted}
-        fix = Do.SERVO_SETTINGS()
-        yield bad("servo", FindingCode.SETTING_DIFFERS, fix, difference=difference, **values)
+        yield FindingCode.SETTING_DIFFERS(difference=difference, **values)
 
 
 def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
     state, limits, safety = found.read_state(), found.limits, context.config.safety
     condition = found.read_condition()
     if condition.hardware_errors:
-        fix: SomeSteps = Do.ACKNOWLEDGE(reboot=True)
-        yield bad("servo", FindingCode.HARDWARE_ERROR, fix, hardware_errors=condition.hardware_errors)
+        yield FindingCode.HARDWARE_ERROR(hardware_errors=condition.hardware_errors)
     if condition.watchdog_tripped:
-        yield warning("servo", FindingCode.WATCHDOG_TRIPPED, Do.STATUS())
+        yield FindingCode.WATCHDOG_TRIPPED()
     if condition.torque:
-        yield warning("servo", FindingCode.TORQUE_ON, Do.STOP())
+        yield FindingCode.TORQUE_ON()
     low, high = limits.voltage_v
     if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
-        fix = "Replace the servo, or its cable if another servo reports the same"
         values = {"voltage_v": state.voltage_v, "temperature_c": state.temperature_c}
-        yield bad("servo", FindingCode.IMPOSSIBLE_VALUES, fix, **values)
+        yield FindingCode.IMPOSSIBLE_VALUES(**values)
         return
     beyond_v = max(low - state.voltage_v, state.voltage_v - high)
     level = graded(bad=beyond_v > 0, warning=beyond_v > -safety.voltage_margin_v)
     supply = {"voltage_v": state.voltage_v, "low_v": low, "high_v": high}
-    yield finding(level, "servo", FindingCode.SUPPLY, "Check the power supply and its plug", **supply)
+    yield FindingCode.SUPPLY((), level, **supply)
     level = graded(bad=state.temperature_c >= limits.temperature_c - safety.temperature_margin_c)
     temperature = {"temperature_c": state.temperature_c, "limit_c": limits.temperature_c}
-    fix = "Let it cool, and find out why the table is hard to rotate"
-    yield finding(level, "servo", FindingCode.TEMPERATURE, fix, **temperature)
+    yield FindingCode.TEMPERATURE((), level, **temperature)
 
 
 def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Iterator[Finding]:
@@ -181,20 +172,18 @@ def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Iterator[Find
     each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
     after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
-        fix: SomeSteps = ("Switch the servo's supply off and on, then", Do.DOCTOR())
-        yield bad("servo", FindingCode.SERVO_FROZEN, fix, tick_ms=ticks, readings=READS)
+        yield FindingCode.SERVO_FROZEN(tick_ms=ticks, readings=READS)
         return
     again = after["retries"] - before["retries"]
     quality = {"readings": READS, "reading_ms": each_ms, "retries": again}
     if again > REPEATED:
-        yield warning("servo", FindingCode.READINGS, "Check the plugs of the servo's cable", **quality)
+        yield FindingCode.READINGS(**quality)
     elif each_ms > SLOW * 1e3 * context.config.table.poll_s:
         port = context.computer.serial_port(context.config.servo.port)
         fix = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
-        fix = fix or Do.SERVO_BAUD(baud=1000000)
-        yield warning("servo", FindingCode.SLOW_READINGS, fix, **quality)
+        yield FindingCode.SLOW_READINGS(fix or Do.SERVO_BAUD(baud=1000000), **quality)
     else:
-        yield fine("servo", FindingCode.READINGS, **quality)
+        yield FindingCode.READINGS((), Severity.FINE, **quality)
 
 
 def _ticks(found: DynamixelServo) -> int | None:

@@ -5,6 +5,7 @@ import platform
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from importlib.metadata import distributions
 from io import BytesIO
 from pathlib import Path
@@ -16,11 +17,10 @@ from rig.config import RigConfig
 from rig.core.errors import ConfigError, RigError
 from rig.core.json_form import plain
 from rig.core.masking import masked
-from rig.core.next_steps import Do
 from rig.doctor import examination
 from rig.doctor.checks import CHECKS
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error
+from rig.doctor.finding import Finding, FindingCode, Severity, of_error
 from rig.jobs.desk import JobResult, Steps
 from rig.safety.saved_state import FileStore
 
@@ -34,18 +34,10 @@ def check_configuration(
     except ConfigError as error:
         mistakes = error.evidence.get("mistakes") or [f"{key}: {value}" for key, value in error.evidence.items()]
         what = error.what.rstrip(".")
-        return None, tuple(
-            bad(
-                "config",
-                FindingCode.CONFIG_MISTAKE,
-                Do.CHECK_CONFIGURATION(),
-                error.exit_code,
-                what=what,
-                mistake=mistake,
-            )
-            for mistake in mistakes or [error.what]
-        )
-    return config, (fine("config", FindingCode.CONFIG_VALID if path else FindingCode.CONFIG_MISSING, path=path),)
+        found = (FindingCode.CONFIG_MISTAKE(what=what, mistake=mistake) for mistake in mistakes or [error.what])
+        return None, tuple(replace(one, topic="config", exit_code=error.exit_code) for one in found)
+    code = FindingCode.CONFIG_VALID if path else FindingCode.CONFIG_MISSING
+    return config, (replace(code(path=path), topic="config"),)
 
 
 def examine(
@@ -96,7 +88,7 @@ def _findings(
         with opened as context:
             yield from examination.run_checks(context, CHECKS, progress)
     except RigError as error:  # there is no such bench, or no such part of it
-        yield of_error("bench", error)
+        yield replace(of_error(error), topic="bench")
 
 
 def support_bundle(

@@ -46,6 +46,7 @@ def test_missing_catalog_names_the_bench_that_has_one(rig, monkeypatch, tmp_path
     assert none.exit_code == 7
     assert "Enroll an object: `rig enroll NAME --bench hardware`" in none.stderr
     assert rig("enroll", "dice", "--views", "4", "--bench", "sim", *SMALL_WORDS).exit_code == 0
+    assert "There is no bench 'nobench'." in rig("identify", "--bench", "nobench").stderr
     for arguments in (("catalog", "list"), ("identify",), ("export", "all.zip"), ("log",)):
         done = rig(*arguments)
         assert done.exit_code == 7

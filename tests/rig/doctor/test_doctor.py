@@ -15,7 +15,7 @@ from rig.core.next_steps import Do
 from rig.doctor.checks import CHECKS
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.examination import Check, run_checks
-from rig.doctor.finding import FindingCode, Severity, fine
+from rig.doctor.finding import FindingCode, Severity
 from sim.faults import Fault, Faults, fault_kinds
 from tests.rig.catalog.catalog_samples import fill
 from tests.rig.doctor.doctor_parts import unopened
@@ -345,16 +345,16 @@ def test_hanging_or_failing_check_stops_no_other():
     released = threading.Event()
 
     def hangs(context):
-        yield fine("hangs", FindingCode.ONLY_SERVO)
+        yield FindingCode.ONLY_SERVO()
         released.wait()
-        yield fine("hangs", FindingCode.ONLY_SERVO)
+        yield FindingCode.ONLY_SERVO()
 
     def silent(context):
         raise DeviceSilent("No answer.", next_step="Knock.")
         yield
 
     def pulled(context):
-        yield fine("pulled", FindingCode.ONLY_SERVO)
+        yield FindingCode.ONLY_SERVO()
         raise OSError(5, "Input/output error")
 
     def broken(context):
@@ -362,18 +362,18 @@ def test_hanging_or_failing_check_stops_no_other():
         raise KeyError("oh")
 
     checks = [
-        Check("hangs", hangs, deadline_s=0.05, if_it_hangs="Pull the plug"),
+        Check("hangs", hangs, deadline_s=0.05),
         Check("silent", silent),
         Check("pulled", pulled),
         Check("broken", broken),
-        Check("well", lambda _: iter([fine("well", FindingCode.ONLY_SERVO)])),
+        Check("well", lambda _: iter([FindingCode.ONLY_SERVO()])),
     ]
     with unopened() as bench:
         findings = list(run_checks(bench.context, checks))
     released.set()
     assert [(f.topic, f.code, f.steps, f.exit_code) for f in findings] == [
         ("hangs", FindingCode.ONLY_SERVO, (), 0),
-        ("hangs", FindingCode.CHECK_TIMED_OUT, ("Pull the plug",), 9),
+        ("hangs", FindingCode.CHECK_TIMED_OUT, FindingCode.CHECK_TIMED_OUT.fix, 9),
         ("silent", FindingCode.ERROR, ("Knock.",), 4),
         ("pulled", FindingCode.ONLY_SERVO, (), 0),
         ("pulled", FindingCode.CHECK_INTERRUPTED, (Do.DOCTOR(),), 4),
