@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from rig.cli.bench import config, doctor, head, serve, servo, snapshot, table
-from rig.cli.catalog import catalog, exchange, results, upkeep  # noqa: F401 - upkeep adds its commands
+from rig.cli.catalog import catalog, exchange, results
 from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
 from rig.cli.ui.exit_codes import EXIT_CODES

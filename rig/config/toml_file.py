@@ -200,7 +200,7 @@ def _parts(words: str) -> Key:
 
 
 def _behind_value(line: str) -> str:
-    """Return what follows the value of a line: its comment and its end. Raises `ValueError`: it goes on below."""
+    """Return what follows the value of a line: its comment and its end. Raises `ValueError`: it has several lines."""
     for end in (*(sign.start() for sign in re.finditer("#", line)), len(line)):
         with suppress(tomllib.TOMLDecodeError):
             tomllib.loads(line[:end])

@@ -38,24 +38,10 @@ class Settings:
     opened: list[str] = field(default_factory=list, repr=False, compare=False)
     """Benches that the command has opened."""
 
-    def merged(
-        self,
-        *,
-        bench: str | None = None,
-        config: Path | None = None,
-        overrides: list[str] | None = None,
-        seed: int | None = None,
-        json: bool = False,
-    ) -> "Settings":
-        """Return these settings, replaced by those that follow the command."""
-        return replace(
-            self,
-            bench=bench or self.bench,
-            config=config or self.config,
-            overrides=(*self.overrides, *(overrides or ())),
-            seed=self.seed if seed is None else seed,
-            json=json or self.json,
-        )
+    def merged(self, *, overrides: list[str] | None = None, **given: Any) -> "Settings":
+        """Return these settings, replaced by those of `CommonOptions` that follow the command."""
+        changed = {name: value for name, value in given.items() if value is not None and value is not False}
+        return replace(self, overrides=(*self.overrides, *(overrides or ())), **changed)
 
     def tracing(self, file: Path) -> "Settings":
         """Return these settings, with a trace of the next bench in a file."""
