@@ -366,23 +366,6 @@ def enrollment_items(record: EnrollmentRecord) -> Iterator[SummaryItem]:
     views = record.views
     yield SummaryItem("views", f"{len(views)}", f"of {record.planned} planned")
     yield SummaryItem("retakes", f"{record.retakes}", listed(reason for view in views for reason in view.rejected))
-    if views:
-        sharpness = [view.evidence.sharpness for view in views]
-        levels = [view.evidence.mean_level for view in views]
-        yield SummaryItem(
-            "sharpness", f"{median(sharpness):.0f}", f"median; {min(sharpness):.0f} to {max(sharpness):.0f}"
-        )
-        yield SummaryItem("mean level", f"{fmean(levels):.0f}", f"of 255; {min(levels):.0f} to {max(levels):.0f}")
-    moves = [view.move for view in views if view.move is not None]
-    if moves:
-        off = max(abs(move.encoder_deg - move.commanded_deg) for move in moves)
-        yield SummaryItem("position error", f"{off:.2f}°", "largest, by the encoder")
-    gaps = [
-        abs(move.rotation_encoder_deg - move.rotation_imu_deg) for move in moves if move.rotation_imu_deg is not None
-    ]
-    if gaps:
-        agree = f"largest difference; {sum(move.agrees for move in moves)} of {len(moves)} moves agree"
-        yield SummaryItem("encoder against gyro", f"{max(gaps):.2f}°", agree)
     if record.similar:
         yield SummaryItem("compared with the catalog", "; ".join(similar_objects_words(record.similar)))
     if record.result:
