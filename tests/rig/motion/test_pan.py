@@ -61,7 +61,10 @@ def test_azimuths_agree_whether_object_or_camera_rotates(
         assert min(unlike, key=lambda side: unlike[side]) == azimuth
 
 
-@pytest.mark.parametrize(("strategy", "photographs"), [("ahbr", False), ("dense", False), ("dense", True)])
+@pytest.mark.parametrize(
+    ("strategy", "photographs"),
+    [pytest.param("ahbr", False, marks=pytest.mark.nightly), ("dense", False), ("dense", True)],
+)
 def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strategy: str, photographs: bool) -> None:
     """The background differs in each view; whole frames (AHBR) and the rig's own search find the object again.
 
