@@ -89,15 +89,6 @@ def test_equals_the_literal_definition_on_large_images(height: int, width: int) 
     assert cedd(image).tolist() == cedd_reference(image)
 
 
-@pytest.mark.parametrize(
-    "side",
-    [2, 39, 40, 41, 81, *(pytest.param(n, marks=pytest.mark.nightly) for n in (3, 38, 79, 80, 119, 120, 159, 160))],
-)
-def test_equals_the_literal_definition_at_the_borders_of_the_grids(side: int) -> None:
-    for image in (noise(side, side), noise(side + 1, side), noise(side, side + 40)):
-        assert cedd(image).tolist() == cedd_reference(image)
-
-
 def test_sums_of_tall_blocks_do_not_overflow() -> None:
     """Quarters of 260 rows: the sums of white need more than 16 bits."""
     image = noise(10_400, 40) | np.uint8(254)
@@ -192,11 +183,6 @@ def test_hsv_of_every_shade_equals_the_literal_definition() -> None:
         found = _hsv(np.column_stack(order).astype(np.float32))[:, ::7]
         blue, green, red = (channel[::7].tolist() for channel in order)
         assert found.T.tolist() == [list(hsv(*rgb)) for rgb in zip(red, green, blue, strict=True)]
-
-
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 200), (200, 1)])
-def test_image_without_a_block_gives_zeros(height: int, width: int) -> None:
-    assert not cedd(noise(height, width)).any()
 
 
 def test_pixels_outside_the_grid_are_ignored() -> None:

@@ -18,11 +18,6 @@ def test_motion_kernel_equals_matlab() -> None:
     np.testing.assert_allclose(motion_kernel(3, 45), expected, atol=5e-5)
 
 
-def test_horizontal_motion_is_a_box_and_vertical_motion_its_transpose() -> None:
-    np.testing.assert_allclose(motion_kernel(15, 0), np.full((1, 15), 1 / 15), atol=1e-12)
-    np.testing.assert_allclose(motion_kernel(9, 90), np.full((9, 1), 1 / 9), atol=1e-12)
-
-
 @examples(10)
 @given(st.floats(1, 40), st.floats(-720, 720))
 def test_motion_kernel_is_a_symmetric_mean_along_its_direction(length: float, angle: float) -> None:
