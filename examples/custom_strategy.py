@@ -49,7 +49,7 @@ def main() -> None:
         Catalog.open(folder, clock=bench.clock) as catalog,
     ):
         for name in OBJECTS:
-            for _ in enroll(bench, catalog, name, views=12):
+            for _ in enroll(bench, catalog, name, views=8):
                 pass
         operator = bench.placer
         assert isinstance(operator, ShelfOperator)  # simulated; on a real bench the operator places the object
