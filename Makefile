@@ -22,9 +22,9 @@ help:
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
 	@echo "make test-servers  test PostgreSQL, S3 and bluesky with real servers"
 	@echo "make fuzz   attack every kind of input, 5 to 45 minutes (a part of test-nightly)"
-	@echo "make lint   check formatting, lint, types and import contracts"
+	@echo "make lint   check formatting, lint, types, import contracts and licenses"
 	@echo "make docs   build the documentation as a site in site/"
-	@echo "make wheel  build wheel and sdist in dist/, and try the wheel in an empty environment"
+	@echo "make wheel  build wheels and sdist in dist/, compare them with a second build, and try the wheel in an empty environment"
 	@echo "make bench  measure speeds, as ratios to other programs"
 	@echo "make clean  remove the files that these commands made"
 
@@ -77,6 +77,7 @@ lint: $(READY)
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+	@$(BIN)/reuse lint --lines
 
 # This uses no network: the theme loads no fonts, and links to other sites are not followed.
 docs: $(READY)
