@@ -179,6 +179,7 @@ def evaluate(
     found.estimates, found.residual = axis.fit()
     found.evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
     found.evidence["view_rms_px"] = axis.view_rms_px
+    found.evidence["lens"] = axis.lens
     _check(found, board, space)
 
     # The region of interest: the image of the object space, as far as it is within the frame.
@@ -240,6 +241,8 @@ class _Axis:
             self._start[begin : begin + 3] = cv2.Rodrigues(at_zero)[0].ravel()
             self._start[begin + 3 : begin + 6] = place
         self.view_rms_px: list[float] = []
+        self.lens: list[float] = []
+        """The camera's parameters that belong to the fitted axis: the known ones, moved within their uncertainty."""
         self.centres_mm = np.array([cv2.Rodrigues(r)[0] @ self._middle + t.ravel() for r, t in poses])
         offset = self.centres_mm - self._origin
         radial = np.linalg.norm(offset - np.outer(offset @ self._up, self._up), axis=1)
@@ -256,6 +259,7 @@ class _Axis:
             start[4:6] = radians(0.05) * np.array([np.cos(angle), np.sin(angle)])
         tried = [self._solved(start, evaluations=15) for start in starts]
         solved = self._solved(min(tried, key=lambda found: float(found.cost)).x, evaluations=60)
+        self.lens = solved.x[7:FIRST_POSE].tolist()
         residuals = self._residuals(solved.x)[: -self._known.size]
         squares = (residuals.reshape(-1, 2) ** 2).sum(axis=1)
         ends = np.cumsum([len(part) for part in self._points])[:-1]

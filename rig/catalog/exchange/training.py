@@ -17,14 +17,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.segmentation import BoxMethod
+from hbr.segmentation import BoxMethod, Segmentation
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import described
 from rig.catalog.exchange.new_files import new_folder
 from rig.catalog.facts import Session, View
 from rig.catalog.images import Images, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.records import Region, this_software
+from rig.catalog.records import JsonObject, Region, this_software
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.config import ViewConfig
 from rig.config.catalog_place import DATABASE_NAME
@@ -134,20 +134,28 @@ def write_training(
 
 def _masks(folder: Path, portion: tuple[_Picture, ...]) -> list[_Mask]:
     """Return where the objects are in images of the catalog in a folder. Runs in a worker process."""
-    return [_mask(folder, picture) for picture in portion]
+    images = Images(folder)
+    return [_mask(images, picture) for picture in portion]
 
 
-def _mask(folder: Path, picture: _Picture) -> _Mask:
-    image = Images(folder).pixels(picture.view.image)
-    describer = _describer(folder, picture.view.region, picture.session.empty_table)
-    found = describer.segment(image, picture.view.azimuth_deg, json.loads(picture.segmentation))
-    height, width = image.shape[:2]
-    x0, y0, w, h = picture.view.region or (0, 0, width, height)
-    whole = np.zeros((height, width), np.bool_)
-    part = within(whole, picture.view.region)  # type: ignore[arg-type] # a view of it
-    part[:] = found.frame_mask(w, h)
-    if found.box is None or not part.any():
-        part[:] = True
+def silhouette(
+    images: Images, view: View, session: Session, segmentation: JsonObject
+) -> tuple[NDArray[np.bool_], Segmentation]:
+    """Return the object's pixels in the image of a view, and where it was found; none if it was not."""
+    image = images.pixels(view.image)
+    found = _describer(images, view.region, session.empty_table).segment(image, view.azimuth_deg, segmentation)
+    whole = np.zeros(image.shape[:2], np.bool_)
+    part = within(whole, view.region)  # type: ignore[arg-type] # a view of it
+    part[:] = found.frame_mask(*part.shape[::-1])
+    return whole, found
+
+
+def _mask(images: Images, picture: _Picture) -> _Mask:
+    whole, found = silhouette(images, picture.view, picture.session, json.loads(picture.segmentation))
+    height, width = whole.shape
+    x0, y0, *_ = picture.view.region or (0, 0)
+    if found.box is None or not whole.any():
+        within(whole, picture.view.region)[:] = True  # type: ignore[arg-type]
         return _Mask(width, height, BoxMethod.NONE.value, None, _counts(whole), [])
     x, y, box_width, box_height = found.box
     polygon = [[px / width, py / height] for px, py in _outline(whole)]
@@ -156,8 +164,8 @@ def _mask(folder: Path, picture: _Picture) -> _Mask:
 
 
 @lru_cache(maxsize=4)
-def _describer(folder: Path, region: Region | None, empty_table: str | None) -> ViewDescriber:
-    table = None if empty_table is None else Images(folder).pixels(empty_table)
+def _describer(images: Images, region: Region | None, empty_table: str | None) -> ViewDescriber:
+    table = None if empty_table is None else images.pixels(empty_table)
     return ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), table)
 
 

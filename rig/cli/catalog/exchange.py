@@ -179,7 +179,7 @@ def export(
         typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all)."),
     ] = None,
     format_: Annotated[
-        Literal["bundle", "folder", "csv", "json", "parquet", "coco", "yolo"] | None,
+        Literal["bundle", "folder", "csv", "json", "parquet", "coco", "yolo", "colmap", "nerfstudio"] | None,
         typer.Option("--format", help="Format (default: by the suffix of the target, folder without one)."),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
@@ -188,13 +188,17 @@ def export(
 
     Formats: bundle (for rig import), folder (images named as in COIL-100, with a table views.csv), csv,
     json and parquet (table without images), coco and yolo (training sets with boxes and masks, divided into train, val
-    and test).
+    and test), colmap and nerfstudio (one object with masks and the poses of the camera, to reconstruct it).
 
     Example: rig export tray.rigcat.zip --label kitchen --bench sim
 
     Example: rig export training --format coco --bench sim
+
+    Example: rig export scan mug-white --format colmap --bench sim
     """
+    from rig.calibrations import CalibrationStore
     from rig.catalog.exchange.bundle import write_bundle
+    from rig.catalog.exchange.scan import ScanFormat, write_scan
     from rig.catalog.exchange.tables import TableFormat, write_folder, write_views
     from rig.catalog.exchange.training import Annotations, write_training
     from rig.catalog.transfer import CatalogSource
@@ -227,6 +231,10 @@ def export(
                 if done.without_mask:
                     what = "marked as a region to ignore" if form == "coco" else "left out"
                     words += f" No object was found in {counted(done.without_mask, 'view')}, {what}."
+            case "colmap" | "nerfstudio":
+                results = CalibrationStore(settings.load().calibration_path(settings.bench_name)).history()
+                views = write_scan(target, source, ScanFormat(form), results)
+                count, values, words = 1, {"views": views}, f" Views: {views}."
             case "bundle":
                 count = write_bundle(target, source)
             case "folder":
