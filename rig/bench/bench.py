@@ -22,6 +22,7 @@ from rig.config.values import Values, config_mistakes, validate
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError, TorqueStaysOn
 from rig.core.next_steps import NextSteps
+from rig.core.notify import notify
 from rig.core.signals import uninterrupted
 from rig.devices.camera import Camera
 from rig.devices.head.head import RigHead
@@ -98,6 +99,11 @@ class Bench(AbstractContextManager["Bench"]):
 
     def __post_init__(self) -> None:
         self.safety = Safety(self.servo, self.config, self.clock, self.state)
+        self.safety.fault_observers.append(self._notify_fault)
+
+    def _notify_fault(self, error: RigError) -> None:
+        message = {"event": "fault", "bench": self.name, "text": f"{self.name}: {error.what}", "fault": error.as_dict()}
+        notify(self.config.notify_command, message)
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._end = SessionEnd.of(error)

@@ -160,6 +160,11 @@ class RigConfig(Section):
     trace: Path | None = Field(
         None, description="new file that records what the bench exchanges with its devices; none: no recording"
     )
+    notify_command: list[str] = Field(
+        default_factory=list,
+        description="program and its arguments, run with JSON on stdin when a job has ended or a fault was latched; "
+        "no shell reads it",
+    )
     servo: ServoConfig = ServoConfig()
     table: TableConfig = TableConfig()
     mark: MarkConfig = MarkConfig()

@@ -139,6 +139,8 @@ class Safety:
         self.monitors: list[Callable[[], object]] = []
         """Called in each round of the control loop; each raises a `RigError` if its device stopped the bench."""
         self.observers: list[Callable[[ServoState], object]] = []
+        self.fault_observers: list[Callable[[RigError], object]] = []
+        """Hear of each fault that is latched; they must return at once."""
         """Called with each reading of the servo in the control loop: for displays. They must not raise or wait."""
         self.restore_actions: list[Callable[[], object]] = []
         """Called first when a fault is acknowledged: each switches on again what its device switched off."""
@@ -319,6 +321,8 @@ class Safety:
             except StateNotStored as not_stored:
                 self._add_acknowledgement(error, is_stored=False)
                 error.add_note(f"The fault is latched in this program only. {not_stored.what}")
+            for tell in self.fault_observers:
+                tell(error)
 
     def _add_acknowledgement(self, error: RigError, *, is_stored: bool = True) -> None:
         """Add to the next step of a fault that it is acknowledged at the end, unless the error says when."""

@@ -37,9 +37,10 @@ def new_token() -> str:
 
 
 class Role(StrEnum):
-    """The rights of a token: to watch, or also to operate the bench."""
+    """The rights of a token: to watch, also to propose jobs that an operator approves, or to operate the bench."""
 
     WATCH = "watch"
+    PROPOSE = "propose"
     OPERATE = "operate"
 
 

@@ -26,7 +26,7 @@ from rig.web.answers import (
 )
 from rig.web.hub import MAX_LISTENERS
 from rig.web.requests import AnswerBody, GotoRequest, Job, JobRequest, LeaseBody, LoginBody
-from rig.web.server import API, COOKIE, OperatorPerson, Page, Routes, Server, Watcher, require_operate, schemes
+from rig.web.server import API, COOKIE, OperatorPerson, Page, Proposer, Routes, Server, Watcher, require_operate, schemes
 
 IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
@@ -156,18 +156,21 @@ def add_jobs(routes: Routes, server: Server) -> None:
         """List the jobs, the newest first."""
         return page.of(server.remote.call("jobs"), "id")
 
-    @routes.operate.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
+    @routes.watch.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
     def submit_job(
-        body: JobRequest, person: OperatorPerson, response: Response, idempotency_key: IdempotencyKey = None
+        body: JobRequest, person: Proposer, response: Response, idempotency_key: IdempotencyKey = None
     ) -> Any:
-        """Add a job to the queue.
+        """Add a job to the queue. A token with the role propose needs no lease, and its job waits for an approval.
 
         The same request with the same header `Idempotency-Key` returns the job of the first one: repeat it after a lost
         answer.
         """
         if isinstance(body, GotoRequest):  # it would fail later, behind the jobs that wait
             check_angle(body.angle_deg, server.setup.config.table.limits_deg)
-        job = server.remote.call("submit", request=body, operator=person.name, key=idempotency_key)
+        proposed = person.role is Role.PROPOSE
+        job = server.remote.call(
+            "submit", request=body, operator=person.name, key=idempotency_key, proposed=proposed
+        )
         response.headers["Location"] = f"{API}/jobs/{job['id']}"
         return job
 
@@ -175,6 +178,11 @@ def add_jobs(routes: Routes, server: Server) -> None:
     def get_job(job_id: str) -> Any:
         """Return a job."""
         return server.remote.call("job", job_id=job_id)
+
+    @routes.operate.post("/jobs/{job_id}/approve", tags=["jobs"], response_model=Job)
+    def approve_job(job_id: str, person: OperatorPerson) -> Any:
+        """Approve a proposed job, which then waits for the bench."""
+        return server.remote.call("approve", job_id=job_id, operator=person.name)
 
     @routes.operate.post("/jobs/{job_id}/cancel", tags=["jobs"], response_model=Job)
     def cancel_job(job_id: str) -> Any:

@@ -69,8 +69,10 @@ class JobQueue:
         with self._lock:
             return self._find(job_id).model_copy()
 
-    def submit(self, request: JobRequest, operator: str, key: str | None = None) -> Job:
+    def submit(self, request: JobRequest, operator: str, key: str | None = None, proposed: bool = False) -> Job:
         """Add a job to the queue and return it; if the operator has submitted it with this ``key``, return that job.
+
+        A ``proposed`` job waits until it is approved.
 
         Raises `JobRejected`: too many jobs wait, or too large ones. `UsageError`: the key was that of another request.
         """
@@ -84,7 +86,7 @@ class JobQueue:
                         evidence={"job": earlier.id},
                     )
                 return earlier.model_copy()
-            waiting = self._waiting()
+            waiting = self._waiting(JobState.QUEUED, JobState.PROPOSED)
             size = len(request.model_dump_json()) + sum(len(self._texts[job.id]) for job in waiting)
             if len(waiting) >= MAX_QUEUED or size > MAX_QUEUED_BYTES:
                 raise JobRejected(
@@ -95,7 +97,7 @@ class JobQueue:
             job = Job(
                 id=secrets.token_hex(6),
                 request=request,
-                state=JobState.QUEUED,
+                state=JobState.PROPOSED if proposed else JobState.QUEUED,
                 created_utc=self._now(),
                 operator=operator,
                 key=key,
@@ -105,11 +107,23 @@ class JobQueue:
             self._arrived.notify_all()
             return job.model_copy()
 
+    def approve(self, job_id: str, operator: str) -> Job:
+        """Let a proposed job start when those before it have ended. Raises `JobNotFound`, `JobRejected`."""
+        with self._lock:
+            self.heed_stops()
+            job = self._unended(job_id)
+            if job.state is not JobState.PROPOSED:
+                raise JobRejected(f"The job is {job.state}, not proposed.", next_step="Look at its state.")
+            job.state, job.approved_by = JobState.QUEUED, operator
+            self._store(job)
+            self._arrived.notify_all()
+            return job.model_copy()
+
     def cancel(self, job_id: str) -> Job:
         """Cancel a job; a running one ends at its next step. Raises `JobNotFound`, `JobRejected`."""
         with self._lock:
             job = self._unended(job_id)
-            if job.state is JobState.QUEUED:
+            if job.state in (JobState.QUEUED, JobState.PROPOSED):
                 self._end(JobState.CANCELLED, job)
             else:
                 self._cancelled.add(job_id)
@@ -123,7 +137,7 @@ class JobQueue:
                 return False
             self.heeded = stops
             self._cancelled |= {job.id for job in self._jobs.values() if not job.state.ended}
-            self._end(JobState.CANCELLED, *self._waiting())
+            self._end(JobState.CANCELLED, *self._waiting(JobState.QUEUED, JobState.PROPOSED))
             return True
 
     def hold(self) -> None:
@@ -220,8 +234,9 @@ class JobQueue:
 
     # -- inside -------------------------------------------------------------------------------------------------------
 
-    def _waiting(self) -> list[Job]:
-        return [job for job in self._jobs.values() if job.state is JobState.QUEUED]
+    def _waiting(self, *states: JobState) -> list[Job]:
+        """Return the jobs that wait for the bench; of these ``states`` if any are given."""
+        return [job for job in self._jobs.values() if job.state in (states or (JobState.QUEUED,))]
 
     def _submitted(self, operator: str, key: str) -> Job | None:
         """Return the job that an operator has submitted with a key, if it is not dropped."""

@@ -147,6 +147,7 @@ class JobQuestion(_Request):
 class JobState(StrEnum):
     """State of a job."""
 
+    PROPOSED = "proposed"
     QUEUED = "queued"
     RUNNING = "running"
     WAITING = "waiting"
@@ -175,7 +176,7 @@ class Job(BaseModel):
 
     ``key`` is the header ``Idempotency-Key`` of its request. ``error`` has the fields of an error as ``rig --json``
     prints them. ``resume`` is the request that continues the job's work; None if there is nothing to continue.
-    ``result`` is the last important event of the plan.
+    ``result`` is the last important event of the plan. A proposed job waits until an operator approves it.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -186,6 +187,7 @@ class Job(BaseModel):
     created_utc: str
     operator: str
     key: str | None = None
+    approved_by: str | None = Field(None, description="who approved a proposed job")
     started_utc: str | None = None
     ended_utc: str | None = None
     progress: StepsDone | None = None

@@ -130,10 +130,15 @@ async def operator(request: Request, person: Annotated[Person, Depends(watcher)]
     return person
 
 
+async def proposer(request: Request, person: Annotated[Person, Depends(watcher)]) -> Person:
+    """Return the sender, who may propose jobs, or is an operator with the lease. Raises as `operator`."""
+    return person if person.role is Role.PROPOSE else await operator(request, person)
+
+
 def require_operate(person: Person) -> None:
     if person.role is not Role.OPERATE:
         raise Forbidden(
-            f"The token {person.name} may only watch.",
+            f"The token {person.name} may only {person.role}.",
             next_step=("Use a token with the role operate.", Do.NEW_TOKEN(role="operate")),
         )
 
@@ -151,6 +156,7 @@ async def long_work(work: Callable[[], Result]) -> Result:
 
 
 Watcher = Annotated[Person, Depends(watcher)]
+Proposer = Annotated[Person, Depends(proposer)]
 OperatorPerson = Annotated[Person, Depends(operator)]
 
 

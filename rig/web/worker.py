@@ -20,6 +20,7 @@ from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
 from rig.core.next_steps import steps_as_json
+from rig.core.notify import notify
 from rig.devices.servo import ServoState
 from rig.motion.traces import stored
 from rig.safety.saved_state import SERVER_FOLDER
@@ -40,7 +41,7 @@ IDLE_STATUS_S: Final = 1.0  # at rest, the state changes by hand or supply only,
 REOPEN_S: Final = 5.0
 """Time after which a bench that could not be opened is opened again."""
 JOBS_WITH_PICTURES: Final = 10  # older jobs keep their events, without pictures
-ASKED: Final = ("jobs", "job", "submit", "cancel", "pause", "resume", "answer")
+ASKED: Final = ("jobs", "job", "submit", "approve", "cancel", "pause", "resume", "answer")
 """Functions of the queue that the web process calls."""
 _LOST: Final = (DeviceNotFound, DeviceMismatch, DeviceSilent)
 """After these errors the bench is opened again: a device was unplugged or replaced."""
@@ -196,6 +197,12 @@ class BenchWorker:
             self._error = error
             self.close()
         self.queue.end(job, state, error)
+        bench = self.setup.bench
+        text = f"{bench}: {job.request.kind} {job.state}. {job.result_text}".strip()
+        notify(
+            self.setup.config.notify_command,
+            {"event": "job", "bench": bench, "text": text, "job": job.model_dump(mode="json")},
+        )
         self._jobs_ended[state.value] += 1
         self._read_status()
 

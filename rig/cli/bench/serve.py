@@ -38,7 +38,7 @@ def serve(
     new_token: Annotated[
         str | None, typer.Option("--new-token", metavar="NAME", help="Make a token, print it once, and stop.")
     ] = None,
-    role: Annotated[str, typer.Option(metavar="watch|operate", help="What the new token allows.")] = "watch",
+    role: Annotated[str, typer.Option(metavar="watch|propose|operate", help="What the new token allows.")] = "watch",
     days: Annotated[
         float | None, typer.Option(min=0.01, max=3650, help="How many days the new token is valid (default: always).")
     ] = None,
@@ -73,7 +73,7 @@ def serve(
     tokens = Tokens(folder, SystemClock())
     if new_token is not None:
         if role not in list(Role):
-            raise UsageError(f"{role!r} is not a role.", next_step="Use --role watch or --role operate.")
+            raise UsageError(f"{role!r} is not a role.", next_step="Use --role watch, propose or operate.")
         token = tokens.new(new_token, Role(role), days)
         settings.say(token, {"name": new_token, "role": role, "token": token})
         print("This is the only time that the token is shown. Keep it secret.", file=sys.stderr)

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
+from typing import Any
 
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
@@ -14,7 +15,9 @@ from rig.cli.ui import prompts
 from rig.cli.ui.present import ProgressBar
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
+from rig.core.errors import RigError
 from rig.core.next_steps import in_words
+from rig.core.notify import notify
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
 from rig.events.wording import line
@@ -79,9 +82,11 @@ class CommandDesk(Desk):
 
     def run(self, steps: Steps[object], show: Callable[[Event], None] | None = None) -> object:
         """Run a job to its end, and return what it returns; by default its events are printed line by line."""
+        last: Any = None
+        state, failure = "interrupted", None
         try:
             while True:
-                match next(steps):
+                match last := next(steps):
                     case Remark() as remark:
                         self.note(remark)
                     case JobResult() as result:
@@ -96,9 +101,24 @@ class CommandDesk(Desk):
                     case event:
                         self._settings.say(line(event), event_dict(event))
         except StopIteration as end:
+            state = "done"
             return end.value
+        except RigError as error:
+            state, failure = "failed", error.as_dict()
+            raise
         finally:
             steps.close()
+            if self.config.notify_command:
+                self._notify(getattr(steps, "__name__", "job"), state, failure, last)
+
+    def _notify(self, kind: str, state: str, failure: Any, last: Any) -> None:
+        """Tell the command of the user how a job ended, in the words of the server's jobs."""
+        result = last.values if isinstance(last, JobResult) else event_dict(last) if hasattr(last, "event") else None
+        job = {"kind": kind, "state": state, "error": failure, "result": result}
+        bench = self._settings.bench_name
+        notify(
+            self.config.notify_command, {"event": "job", "bench": bench, "text": f"{bench}: {kind} {state}", "job": job}
+        )
 
 
 def _print_note(text: str) -> None:

@@ -1,0 +1,50 @@
+"""A command of the user that hears when a job has ended or a fault was latched."""
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any, Final
+
+from rig.core.control_characters import neutral
+from rig.core.json_form import plain
+
+LIMIT_S: Final = 30.0
+"""A command that takes longer is killed: it may wait for a network that is gone."""
+
+
+def notify(command: Sequence[str], message: Mapping[str, Any]) -> None:
+    """Run a command with a message as JSON on its stdin, beside the bench: this returns at once.
+
+    The program ends when the command has ended, or after `LIMIT_S`. If the command fails, a warning is printed.
+    """
+    if command:
+        content = json.dumps(plain(message), ensure_ascii=False, default=str) + "\n"
+        threading.Thread(target=_run, args=(list(command), content), name="notify").start()
+
+
+def _run(command: list[str], content: str) -> None:
+    try:
+        # In a session of its own, so that Ctrl+C at the terminal does not end it.
+        ended = subprocess.run(
+            command,
+            input=content.encode(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            timeout=LIMIT_S,
+            start_new_session=True,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        problem = f"it took more than {LIMIT_S:g} s"
+    except OSError as error:
+        problem = error.strerror or str(error)
+    else:
+        if ended.returncode == 0:
+            return
+        problem = f"exit code {ended.returncode}. {ended.stderr.decode(errors='replace').strip()[-300:]}".strip()
+    with suppress(OSError, ValueError):  # stderr is closed
+        text = f"Warning: notify_command ({command[0]}) failed: {problem}. Next step: run it in a terminal."
+        print(neutral(text), file=sys.stderr, flush=True)
