@@ -19,7 +19,7 @@ SINGLE_FILES = (
     "pyproject.toml",
 )
 SINGLE_FILES += (".pre-commit-config.yaml", ".ci/run", ".ci/setup", ".ci/install", ".ci/wheel")
-SINGLE_FILES += ("firmware/Makefile", "docs/deploy/Dockerfile", "docs/deploy/rig.service")
+SINGLE_FILES += ("firmware/Makefile", "docs/deploy/Dockerfile", "docs/deploy/rig.service", "docs/deploy/rig-pi")
 SUFFIXES = {".py", ".md", ".j2", ".toml", ".c", ".h", ".js", ".css", ".sh", ".yml", ".yaml"}
 
 REFUSE = r"refus(?:e|es|ed|al|als|ing)"
