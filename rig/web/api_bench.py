@@ -214,3 +214,11 @@ def add_jobs(routes: Routes, server: Server) -> None:
     def get_job_candidates(job_id: str) -> Svg:
         """Return the chart of the candidates of a recent search as SVG, after its last view."""
         return Svg(server.remote.call("candidates", job_id=job_id), headers={"Cache-Control": "no-store"})
+
+    @routes.watch.get("/jobs/{job_id}/events", tags=["jobs"])
+    def get_job_events(job_id: str) -> Response:
+        """Return the events of a recent job so far, and the id after which a stream continues."""
+        server.remote.call("job", job_id=job_id)
+        events, last = server.hub.of_job(job_id)
+        content = f'{{"items": [{", ".join(events)}], "last": "{last}"}}'
+        return Response(content, media_type="application/json", headers={"Cache-Control": "no-store"})

@@ -78,6 +78,13 @@ class Hub:
             messages = [self._messages[k] for k in range(max(number + 1 - first, 0), len(self._messages))]
         return messages, number + 1 < first
 
+    def of_job(self, job_id: str) -> tuple[list[str], str]:
+        """Return the stored events of a job as JSON texts, and the id of the newest message."""
+        begin = f'{{"job": "{job_id}"'  # as the process of the bench writes them
+        with self._lock:
+            found = [one.data for one in self._messages if one.kind == "plan" and one.data.startswith(begin)]
+            return found, f"{self._epoch}-{self._last}"
+
     def position(self, last_event_id: str | None) -> tuple[int, bool]:
         """Return the number of a message id, and whether messages after it are lost; None is the newest message."""
         if not last_event_id:

@@ -88,12 +88,17 @@ class Outliner:
             return None
         x, y = (0, 0) if self._region is None else self._region[:2]
         height, width = within(image_bgr, self._region).shape[:2]
-        mask = found.frame_mask(width, height).astype(np.uint8)
-        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        points = max(contours, key=cv2.contourArea, default=np.empty((0, 1, 2), np.int32))
-        shortened = cv2.approxPolyDP(points, TOLERANCE_PX, closed=True) if len(points) else points
+        outlines = outlines_of(found.frame_mask(width, height))
         left, top, box_width, box_height = found.box
         return {
             "box": [left + x, top + y, box_width, box_height],
-            "points": [[int(px) + x, int(py) + y] for px, py in shortened.reshape(-1, 2)],
+            "points": [[px + x, py + y] for px, py in outlines[0]] if outlines else [],
         }
+
+
+def outlines_of(mask: NDArray[np.bool_]) -> list[list[list[int]]]:
+    """Return the outlines of the parts of a silhouette, bool (h, w), as points in pixels; the largest part first."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    parts = sorted(contours, key=cv2.contourArea, reverse=True)
+    shortened = (cv2.approxPolyDP(part, TOLERANCE_PX, closed=True).reshape(-1, 2) for part in parts)
+    return [[[int(px), int(py)] for px, py in part] for part in shortened]

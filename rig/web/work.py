@@ -5,6 +5,8 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from rig.bench import Bench
@@ -30,6 +32,7 @@ from rig.motion.move import MotionTimes
 from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
+from rig.views.description import within
 from rig.web import requests
 from rig.web.picture import Outliner, jpeg
 from rig.web.requests import Job, JobState, TrayObject
@@ -153,7 +156,7 @@ class ServedDesk(Desk):
         if self._left is not None:
             self._left.add(event)
         if isinstance(event, Accepted):
-            self._worker.views[job.id].append(jpeg(event.image_bgr, VIEW_PX))
+            self._worker.views[job.id].append(jpeg(self._described(event.image_bgr), VIEW_PX))
             values["picture"] = job.views
             values["outline_px"] = None if self._outline is None else self._outline(event.image_bgr, event.azimuth_deg)
             job.views += 1
@@ -171,6 +174,10 @@ class ServedDesk(Desk):
         self._worker.check(job)
         if isinstance(event, Accepted | Decided):
             self._pause()
+
+    def _described(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the region of a frame that is described."""
+        return within(image_bgr, self._worker.bench().config.view.roi)
 
     def _pause(self) -> None:
         """Wait while the operator wants the job to pause."""

@@ -1,8 +1,35 @@
-import { $, act, followJobs, h, on, start, submit, table } from "./rig.js";
+import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table } from "./rig.js";
+import { pathDrawing, picture, viewPicture } from "./pictures.js";
 
-// -- the tray ------------------------------------------------------------------------------------------------------------
+// -- one object: a name that is known already is a choice ------------------------------------------------------------------
 
+let known = null;
+let asking = null;
+
+/** Say that the name exists, and offer what can be done: continue, replace, another name. */
+async function look() {
+  const name = $("name").value.trim();
+  known = name ? await get(`/objects/${at(name)}`).catch(() => null) : null;
+  const unfinished = known !== null && known.unfinished_views !== null;
+  $("resume").value = String(unfinished);
+  $("replace").value = String(known !== null && !unfinished && known.views > 0);
+  $("exists").hidden = known === null;
+  $("go").textContent = unfinished ? "Continue the enrollment" : known ? "Enroll again" : "Enroll";
+  if (unfinished) $("exists").replaceChildren(h("p", {}, `Its enrollment was interrupted. ${counted(known.unfinished_views, "view")} of it are stored; the others will be taken. `, h("button", { type: "button", class: "link", onclick: () => { $("resume").value = "false"; $("replace").value = "true"; $("go").textContent = "Start again"; } }, "Start again instead")));
+  else if (known) $("exists").replaceChildren(h("p", {}, `${name} is enrolled with ${counted(known.views, "view")}. Its new views replace them when they are complete.`));
+}
+$("name").addEventListener("input", () => { clearTimeout(asking); asking = setTimeout(look, 250); });
+const wanted = new URLSearchParams(location.search).get("name");
+if (wanted) {
+  $("name").value = wanted;
+  look();
+}
+
+// -- the tray: a list that can be edited before the start -----------------------------------------------------------------
+
+const COLUMNS = ["name", "label", "note", "views"];
 let objects = [];
+let states = {};
 
 /** Return the rows of cells of a CSV text. Quotes are those of RFC 4180. */
 export function readCsv(source) {
@@ -25,37 +52,150 @@ export function readCsv(source) {
   return rows.filter((row) => row.some((cell) => cell.trim()));
 }
 
+function stateOf(one) {
+  const state = states[one.name];
+  if (state) return h("span", { class: `tag ${state === "enrolled" ? "good" : state === "now" ? "amber" : ""}` }, state);
+  return h("span", { class: "tag" }, "to do");
+}
+
+/** Show the list, with fields while it can be edited. */
+function showTray(editable = true) {
+  $("tray-section").hidden = objects.length === 0;
+  const cell = (one, key) => h("input", { value: one[key] ?? "", "aria-label": `${key} of ${one.name || "a new object"}`, type: key === "views" ? "number" : "text", min: 4, max: 720, required: key === "name", maxlength: 1000,
+    oninput: (event) => { one[key] = key === "views" && event.target.value ? Number(event.target.value) : event.target.value; } });
+  const rows = objects.map((one, k) => [String(k + 1), ...COLUMNS.map((key) => (editable ? cell(one, key) : one[key])), editable ? h("button", { type: "button", class: "quiet", "aria-label": `Remove ${one.name}`, onclick: () => { objects.splice(k, 1); showTray(); } }, "✕") : stateOf(one)]);
+  table($("rows"), ["", "Name", "Label", "Note", "Views", editable ? "" : "State"], rows);
+  $("tray-start").hidden = !editable;
+  $("tray-clear").hidden = !editable;
+}
+
 $("file").addEventListener("change", () => act(async () => {
-  $("tray-start").disabled = true;
   const [head, ...rows] = readCsv((await $("file").files[0].text()).replace(/^\ufeff/, ""));
   const keys = (head || []).map((cell) => cell.trim().toLowerCase());
-  const unknown = keys.filter((key) => !["name", "label", "note", "views"].includes(key));
+  const unknown = keys.filter((key) => !COLUMNS.includes(key));
   if (!keys.includes("name") || unknown.length) throw Object.assign(new Error("The first line of the file must name the columns: name and, optionally, label, note and views."), { steps: [unknown.length ? `Remove the columns ${unknown.join(", ")}.` : "Add the column \"name\"."] });
   objects = rows.map((row) => {
     const one = {};
     keys.forEach((key, k) => { const cell = (row[k] || "").trim(); if (cell) one[key] = key === "views" ? Number(cell) : cell; });
     return one;
   });
-  const preview = h("table", {});
-  table(preview, ["Name", "Label", "Note", "Views"], objects.map((one) => [one.name, one.label, one.note, one.views]));
-  $("rows").replaceChildren(preview);
-  $("tray-start").disabled = objects.length === 0;
+  states = {};
+  showTray();
 }));
+$("add").addEventListener("click", () => {
+  objects.push({ name: "" });
+  states = {};
+  showTray();
+  $("rows").querySelector("tbody tr:last-child input").focus();
+});
+$("tray-clear").addEventListener("click", () => { objects = []; showTray(); });
 $("tray").addEventListener("submit", (event) => {
   event.preventDefault();
-  submit({ kind: "tray", objects });
+  const filled = objects.map((one) => Object.fromEntries(Object.entries(one).filter(([, value]) => value !== "")));
+  submit({ kind: "tray", objects: filled });
 });
 
-// -- progress -------------------------------------------------------------------------------------------------------------
+// -- the job --------------------------------------------------------------------------------------------------------------
 
-function checks(event) {
-  const e = event.evidence;
-  return `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°: sharpness ${e.sharpness.toFixed(0)}, mean level ${e.mean_level.toFixed(0)}`;
+let job = null;
+let views = [];
+let azimuths = [];
+let name = "";
+let similar = null;
+let rejected = 0;
+
+function say(words, kind, ...detail) {
+  if ($("said").textContent !== words) $("said").textContent = words;
+  $("said").className = `answer ${kind}`;
+  $("said-detail").replaceChildren(...detail.filter(Boolean));
 }
 
-on("shown-plan", (event) => {
-  if (event.event === "rejected") $("thumbs").append(h("li", { class: "error" }, event.text));
-  if (event.event === "similar_objects") $("similar").replaceChildren(...event.text.split("\n").map((words) => h("li", {}, words)));
+function take(event) {
+  switch (event.event) {
+    case "started": [views, azimuths, similar, rejected, name] = [[], [], null, 0, event.name || name]; break;
+    case "item":
+      states[event.name] = event.reason ? "skipped" : "now";
+      break;
+    case "accepted":
+      views.push({ number: event.picture, place: event.index, words: `${event.azimuth_deg.toFixed(0)}°` });
+      azimuths.push(event.azimuth_deg);
+      break;
+    case "rejected": rejected += 1; break;
+    case "similar_objects": similar = event; break;
+    case "enrolled": states[event.name] = "enrolled"; break;
+    default:
+  }
+}
+
+let drawn = 0;
+/** Add the pictures that came; a page that is opened in the middle shows all so far. */
+function showViews() {
+  if (views.length < drawn || !views.length) {
+    $("thumbs").replaceChildren();
+    drawn = 0;
+  }
+  for (const view of views.slice(drawn)) $("thumbs").append(h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), view.words));
+  drawn = views.length;
+  $("views-section").hidden = !views.length;
+  $("views-title").textContent = `${counted(views.length, "view")}${rejected ? `, ${rejected} taken again` : ""}`;
+  $("way").hidden = !azimuths.length || isEnded(job);
+  if (azimuths.length) $("way").replaceChildren(progressRing(azimuths));
+}
+
+/** Return a ring with a dot for each view that is stored. */
+function progressRing(degrees) {
+  const drawing = pathDrawing([]);
+  drawing.setAttribute("aria-label", `${degrees.length} views around the object`);
+  for (const azimuth of degrees) {
+    const angle = (azimuth * Math.PI) / 180;
+    drawing.append(h("circle", { cx: 100 - 82 * Math.sin(angle), cy: 100 - 82 * Math.cos(angle), r: 5, class: "dot c0" }));
+  }
+  return drawing;
+}
+
+let compared = "";
+/** Show what the new object can be confused with: at the side where both look most alike, and where they differ most. */
+async function showSimilar() {
+  const key = similar ? `${similar.name} ${similar.objects.map((one) => one.name)}` : "";
+  if (key === compared) return;
+  compared = key;
+  $("similar-section").hidden = true;
+  if (!similar?.objects.length) return;
+  const parts = [];
+  for (const other of similar.objects) {
+    const found = await get(`/pairs?object=${at(similar.name)}&other=${at(other.name)}`).catch(() => null);
+    if (!found || compared !== key) continue;
+    const pair = (one, words) => h("div", {}, h("h3", {}, words), h("div", { class: "pair" }, picture(viewPicture(one.view), `${similar.name} at ${one.azimuth_deg.toFixed(0)}°`, similar.name), picture(viewPicture(one.other_view), `${other.name} at ${one.other_azimuth_deg.toFixed(0)}°`, other.name)));
+    parts.push(h("div", { class: "columns" }, pair(found.alike, "Most alike"), pair(found.different, "Most different")));
+  }
+  $("similar-title").textContent = `${similar.name} looks like ${similar.objects.map((one) => one.name).join(", ")}`;
+  $("similar").replaceChildren(...parts);
+  $("similar-section").hidden = !parts.length;
+}
+
+followJob(["enroll", "tray"], {
+  begin(next) {
+    job = next;
+    [views, azimuths, similar, rejected, states] = [[], [], null, 0, {}];
+    name = job.request.name || "";
+    if (job.request.kind === "tray" && !isEnded(job)) objects = job.request.objects.map((one) => ({ ...one }));
+  },
+  event: take,
+  render(next) {
+    job = next;
+    const busy = !isEnded(job);
+    $("forms").hidden = busy;
+    showJob($("job"), job, false);
+    const left = job.progress?.seconds_left;
+    if (job.question) say(name || "A tray", "calm");
+    else if (job.state === "queued") say("Waiting for the bench …", "calm");
+    else if (busy) say(name || "Preparing …", "calm", `${job.state === "paused" ? "Paused. " : "Keep your hands off the table. "}${left ? `About ${duration(left)} left.` : ""}`);
+    else if (job.state === "done") say(job.request.kind === "tray" ? "The tray is enrolled" : `${job.request.name} is enrolled`, "found", h("p", {}, similar && !similar.objects.length ? "It looks like no other enrolled object. " : "", job.request.name && h("a", { href: `/object?name=${at(job.request.name)}` }, "Look at it")), h("p", {}, "Put the next object on the table."));
+    else say(job.state === "failed" ? "Not enrolled" : "Interrupted", "unknown", job.error && h("p", {}, `${job.error.what} `, ...nextSteps(job.error.steps)), job.resume && h("p", {}, h("button", { onclick: () => submit(job.resume) }, job.views || job.request.kind === "tray" ? "Continue" : "Try again")));
+    showViews();
+    if (job.request.kind === "tray" && objects.length && Object.keys(states).length) showTray(false);
+    showSimilar();
+  },
 });
-followJobs(["enroll", "tray"], (job, isOther) => { if (isOther) $("similar").replaceChildren(); }, checks);
+on("hello", () => { if (objects.length === 0) showTray(); });
 start();

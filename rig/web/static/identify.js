@@ -1,62 +1,238 @@
-import { $, API, followJobs, h, nextSteps, number, on, percent, start } from "./rig.js";
+import { $, API, act, at, counted, either, followJob, get, h, isEnded, nextSteps, on, percent, remembered, showJob, start, when } from "./rig.js";
+import { pathDrawing, picture, posePicture, viewPicture } from "./pictures.js";
 
-function oneSample() {
-  $("sample").disabled = $("watch").checked;
-  $("sample-why").hidden = !$("watch").checked;
+const SHOWN = 4; // candidates: more are unlikely, and push the steps out of sight
+const KEPT = 10;
+const TWIN = 0.6; // score of the second candidate from which the two are compared
+const EMPTY_TABLE = 606;
+
+// -- the form -----------------------------------------------------------------------------------------------------------
+
+function chooseMode() {
+  const many = $("watch").checked;
+  $("sample").disabled = many;
+  $("sample").hidden = many;
+  $("sample-label").hidden = many;
+  $("scan-label").hidden = !many;
+  $("scan").disabled = !many;
 }
-$("watch").addEventListener("change", oneSample);
-oneSample(); // a browser that reloads the page can keep the tick
+for (const radio of $("start").elements.watch) radio.addEventListener("change", chooseMode);
+chooseMode(); // a browser that reloads the page can keep the choice
+remembered($("sound"), "rig-sound");
 
-function answer(words, kind, ...detail) {
-  $("answer").textContent = words;
-  $("answer").className = `answer ${kind}`;
-  $("answer-detail").replaceChildren(...detail);
-}
-
-/** Show an error. Code 606: the table is empty. */
-export function noAnswer(error) {
-  answer(error.code === 606 ? "No object on the table" : "No answer", "unknown", `${error.what} `, ...nextSteps(error.steps));
-}
-
-function clear() {
-  for (const id of ["steps", "candidates"]) $(id).replaceChildren();
-  answer("Searching …", "", "");
-}
-
-/** Show the chart of the candidates after a number of views. The server draws it; its words are for screen readers. */
-function chart(job, views, candidates, notEnrolled) {
-  const words = candidates.map((one) => `${one.name} ${one.probability === null ? number(one.score, 3) : percent(one.probability)}`);
-  if (typeof notEnrolled === "number") words.push(`not enrolled ${percent(notEnrolled)}`);
-  $("candidates").replaceChildren(h("img", { src: `${API}/jobs/${job}/candidates?views=${views}`, alt: words.join(", ") }));
-}
-
-export function result(event) {
-  const lines = event.text.split("\n").map((text) => h("p", {}, text));
-  if (event.outcome === "found") answer(event.name, "found", ...lines);
-  else if (event.outcome === "ambiguous") answer(event.possible.join(" or "), "ambiguous", ...lines);
-  else answer("Unknown object", "unknown", ...lines);
-  chart(event.job, event.views, event.candidates, event.not_enrolled);
+/** Play a short tone: a rising one for a found object, a falling one for anything else. */
+function play(found) {
+  if (!$("sound").checked) return;
+  navigator.vibrate?.(found ? 80 : [80, 80, 80]);
+  const audio = new AudioContext();
+  [found ? 660 : 440, found ? 880 : 330].forEach((hertz, k) => {
+    const [tone, volume] = [audio.createOscillator(), audio.createGain()];
+    tone.frequency.value = hertz;
+    volume.gain.value = 0.15;
+    tone.connect(volume).connect(audio.destination);
+    tone.start(audio.currentTime + 0.16 * k);
+    tone.stop(audio.currentTime + 0.16 * k + 0.14);
+  });
 }
 
-on("shown-plan", (event) => {
-  if (event.event === "frame_used") return answer("Searching …", "", event.text.trim());
-  if (event.event === "started") clear();
-  if (event.event === "waiting") answer(event.reason === "first-object" ? "Put an object on the table" : "Put the next object on the table", "", "");
-  if (event.event === "ranked") chart(event.job, event.index + 1, event.candidates, event.decision?.not_enrolled);
-  if (event.event === "identified") return result(event);
-  if (event.event === "failed") noAnswer(event);
-  if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
-  if (event.steps?.length) $("steps").append(h("li", {}, "Next step: ", ...nextSteps(event.steps)));
-  return undefined;
-});
-followJobs(["identify"], (job, isOther) => {
-  if (isOther) {
-    clear();
-    if (job.state === "queued") answer("Waiting for the bench …", "", "");
+// -- the search, as its events tell it ------------------------------------------------------------------------------------
+
+let search = null; // of the object on the table: views, steps, candidates
+let shown = null; // the answer that is large
+let ready = false; // whether events are new, not those of a page that was opened later
+
+function newSearch() {
+  search = { views: [], steps: [], notes: [], candidates: [], notEnrolled: null, azimuths: [], rows: [], live: "" };
+}
+newSearch();
+
+const REASONS = {
+  "separates-candidates": (event) => ` to see where ${either(event.candidates.slice(0, 2))} differ`,
+  "less-similar-side": () => " to the side where the candidates look less alike",
+  "several-poses": () => " because it fits in several positions",
+  "new-side": () => " to see another side",
+  "one-candidate": () => " to see another side",
+  "least-risk": () => " to see the side that tells most",
+};
+const AGAIN = { blurred: "it was blurred", "too-dark": "it was too dark", overexposed: "it was too bright", "table-moved": "the table still moved", noise: "it was noisy" };
+
+/** Return a step of the search in plain words; empty for what only the notes tell. */
+function plainStep(event) {
+  switch (event.event) {
+    case "decided": return `Turned ${Math.abs(event.rotation_deg).toFixed(0)}° to the ${event.side}${(REASONS[event.reason] || (() => ""))(event).replace(" or ", " and ")}.`;
+    case "ranked": {
+      const likely = event.candidates.filter((one) => one.probability === null || one.probability > 0.05).slice(0, 3).map((one) => one.name);
+      const unknown = event.decision?.not_enrolled > 0.5;
+      return `View ${event.index + 1}: ${unknown ? "looks like no enrolled object" : `looks like ${either(likely.length ? likely : [event.candidates[0].name])}`}.`;
+    }
+    case "rejected": return `Took view ${event.index + 1} again: ${event.reasons.map((one) => AGAIN[one]).filter(Boolean).join(", ") || "it was not good enough"}.`;
+    case "unwinding": return "Turned back to free the cable.";
+    case "object_changed": return "The object was changed or turned by hand. The search began again.";
+    case "scan_started": return "Turned without a stop.";
+    default: return "";
   }
-  if (job.result && job.result.event === "identified" && !job.request.watch) result({ ...job.result, job: job.id, text: job.result_text });
-  if (job.state === "failed") noAnswer(job.error);
-  if (["cancelled", "interrupted"].includes(job.state)) answer("Stopped", "", "");
-}, (event) => `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`,
-(job) => job.request.watch); // the wait for the next object replaces the answer above
+}
+
+function take(event, job) {
+  const s = search;
+  switch (event.event) {
+    case "started": newSearch(); shown = job.request.watch ? shown : null; break;
+    case "waiting": search.live = event.reason === "first-object" ? "Put an object on the table." : "Put the next object on the table."; break;
+    case "frame_used": s.live = `Looks like ${event.name} …`; break;
+    case "accepted": s.views.push({ number: event.picture, words: `${event.azimuth_deg.toFixed(0)}°` }); s.azimuths.push(event.azimuth_deg); break;
+    case "ranked": s.candidates = event.candidates; s.notEnrolled = event.decision?.not_enrolled ?? null; break;
+    case "identified": keep({ ...event, picture: s.views.at(-1)?.number, search: s }, job); break;
+    case "failed": keep({ event: "failed", outcome: "failed", error: event, search: s }, job); break;
+    case "recorded": if (ready) act(showLast); break;
+    default:
+  }
+  const words = plainStep(event);
+  if (words && event.event === "ranked") s.steps.push({ words });
+  else if (words) s.steps.push({ words, soft: true });
+  if (event.text && event.event !== "identified") s.notes.push(...event.text.split("\n").map((text) => text.trim()));
+  if (event.steps?.length && event.event !== "failed") s.notes.push(...event.steps.filter((step) => typeof step === "string"));
+}
+
+function keep(answer, job) {
+  shown = { ...answer, job: job.id, watch: job.request.watch, time: ready ? new Date().toISOString() : job.ended_utc || job.started_utc };
+  if (ready) play(shown.outcome === "found");
+}
+
+// -- what is shown --------------------------------------------------------------------------------------------------------
+
+let twinOf = "";
+
+function headline(words, kind, ...detail) {
+  if ($("answer").textContent !== words) $("answer").textContent = words;
+  $("answer").className = `answer ${kind}`;
+  $("answer-detail").replaceChildren(...detail.filter(Boolean));
+}
+
+const enrolledPicture = (one, words) => picture(posePicture(one.name, one.pose_deg), `${one.name} as enrolled, from the same side`, h("strong", {}, one.name), words);
+
+/** Show pictures, unless they are there already: the page is drawn again after each event. */
+function setPictures(box, key, make) {
+  if (box.dataset.key === key) return;
+  box.dataset.key = key;
+  box.replaceChildren(...make());
+}
+
+/** Show where two objects differ most, and where they look alike. */
+async function compare(one, other) {
+  const key = `${one}/${other}`;
+  if (twinOf === key) return;
+  twinOf = key;
+  $("twin").hidden = true;
+  if (!other) return;
+  const found = await get(`/pairs?object=${at(one)}&other=${at(other)}`).catch(() => null);
+  if (!found || twinOf !== key) return;
+  $("twin-title").textContent = `${one} and ${other} differ most here`;
+  const { different: pair } = found;
+  $("twin-pictures").replaceChildren(picture(viewPicture(pair.view), `${one} at ${pair.azimuth_deg.toFixed(0)}°`, h("strong", {}, one), `at ${pair.azimuth_deg.toFixed(0)}°`), picture(viewPicture(pair.other_view), `${other} at ${pair.other_azimuth_deg.toFixed(0)}°`, h("strong", {}, other), `at ${pair.other_azimuth_deg.toFixed(0)}°`));
+  $("twin").hidden = false;
+}
+
+function showAnswer(answer) {
+  const { candidates = [], outcome } = answer;
+  const used = counted(answer.views ?? answer.search?.views.length ?? 0, "view");
+  const time = `${when(answer.time)}, ${used}`;
+  const second = candidates[1];
+  let pictures = [];
+  let after = [];
+  if (outcome === "failed") {
+    const { error } = answer;
+    headline(error.code === EMPTY_TABLE ? "No object on the table" : "No answer", "unknown", error.code === EMPTY_TABLE ? "The table is empty. " : `${error.what} `, ...nextSteps(error.steps));
+  } else if (outcome === "found") {
+    const sure = answer.confidence === null || answer.confidence === undefined ? "" : `${percent(answer.confidence)} sure`;
+    const turned = answer.yaw_deg === null || answer.yaw_deg === undefined ? "" : `, turned by ${answer.yaw_deg.toFixed(0)}°`;
+    headline(answer.name, "found", [sure, time].filter(Boolean).join(", ") + turned);
+    pictures = [[candidates[0], `as enrolled, from the same side`]];
+  } else if (outcome === "ambiguous") {
+    headline(either(answer.possible.slice(0, 3)), "ambiguous", `The views do not tell them apart (${time}).`);
+    pictures = answer.possible.slice(0, 2).map((name) => [candidates.find((one) => one.name === name) || { name, pose_deg: 0 }, "as enrolled, from the same side"]);
+  } else {
+    headline(outcome === "unknown" ? "Unknown object" : "No object on the table", "unknown", outcome === "unknown" ? `It is none of the enrolled objects (${time}).` : `The table is empty (${time}).`);
+    if (outcome === "unknown") {
+      pictures = candidates.slice(0, 1).map((one) => [one, "looks most like it, but is another object"]);
+      after = [h("a", { class: "button", href: "/enroll" }, "Enroll it")];
+    }
+  }
+  const key = `${answer.job} ${answer.time} ${outcome} ${answer.name}`;
+  setPictures($("enrolled"), key, () => pictures.map(([one, words]) => enrolledPicture(one, words)));
+  $("enrolled").hidden = !pictures.length;
+  setPictures($("after"), key, () => after);
+  const twins = outcome === "ambiguous" ? answer.possible.slice(0, 2) : outcome === "found" && second?.score > TWIN ? [answer.name, second.name] : [];
+  compare(twins[0] || "", twins[1] || "");
+}
+
+function showSearch() {
+  const s = search;
+  const candidates = s.candidates.slice(0, SHOWN);
+  const best = Math.max(...candidates.map((one) => one.probability ?? one.score), s.notEnrolled ?? 0, 1e-9);
+  const rows = candidates.map((one, k) => h("li", { title: one.probability === null ? `score ${one.score.toFixed(3)}` : percent(one.probability) },
+    h("img", { src: posePicture(one.name, Math.round(one.pose_deg / 15) * 15), alt: "" }),
+    h("div", { class: `c${k}` }, h("span", {}, one.name), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
+  if (s.notEnrolled !== null) rows.push(h("li", { title: percent(s.notEnrolled) }, h("span", { class: "none", "aria-hidden": "true" }, "?"), h("div", { class: "soft" }, h("span", {}, "none of the enrolled objects"), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * s.notEnrolled) / best}%` })))));
+  $("candidates").replaceChildren(...rows);
+  $("way").replaceChildren(pathDrawing(s.azimuths.slice(-9)));
+  $("steps").replaceChildren(...s.steps.slice(-12).map((step) => h("li", { class: step.soft ? "soft" : "" }, step.words)));
+  $("notes").replaceChildren(...s.notes.map((words) => h("li", {}, words)));
+  $("search").hidden = !s.views.length;
+}
+
+function showThumbs(job, views) {
+  const key = `${job} ${views.length}`;
+  setPictures($("thumbs"), key, () => views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job}/views/${view.number}`, alt: "", loading: "lazy" }), view.words)));
+  if (views.length && search.candidates.length) setPictures($("chart"), key, () => [h("img", { src: `${API}/jobs/${job}/candidates?views=${views.length}`, alt: "The candidates after each view", loading: "lazy", style: "width: 100%" })]);
+}
+
+/** Show the last recorded answers; each leads to its place in the history. */
+async function showLast() {
+  const { items } = await get(`/results?limit=${KEPT}`);
+  const words = (one) => (one.outcome === "found" ? one.object : one.outcome === "ambiguous" ? `${one.object} or another` : one.outcome === "unknown" ? "unknown" : "no object");
+  $("last-section").hidden = !items.length;
+  $("last").replaceChildren(...items.map((one) => h("li", {}, h("a", { href: `/runs?result=${one.id}` },
+    one.image && h("img", { src: `${API}/results/${one.id}/image`, alt: "" }), words(one), one.sample && h("span", { class: "soft" }, ` ${one.sample}`), h("br"), h("span", { class: "soft" }, when(one.time_utc))))));
+}
+
+let job = null;
+function redraw() {
+  if (!job) return;
+  const idle = isEnded(job);
+  $("go").disabled = !idle && !job.request.watch;
+  showJob($("job"), job, false);
+  if (shown) showAnswer(shown);
+  else if (isEnded(job)) headline("Stopped", "calm", "No answer. Nothing was recorded.");
+  else {
+    $("enrolled").hidden = true;
+    $("after").replaceChildren();
+    compare("", "");
+    if (job.state === "queued") headline("Waiting for the bench …", "calm");
+    else if (!idle) headline(search.live && !search.views.length ? search.live : "Searching …", "calm", search.steps.at(-1)?.words || "");
+  }
+  if (shown && job.request.watch && !idle) $("answer-detail").append(h("p", {}, h("strong", {}, search !== shown.search && search.views.length ? "Searching the next object …" : search.live)));
+  showSearch();
+  showThumbs(job.id, search.views);
+}
+
+followJob(["identify"], {
+  begin(next) {
+    job = next;
+    ready = false;
+    [shown, twinOf] = [null, ""];
+    newSearch();
+  },
+  event: take,
+  render(next, loaded) {
+    job = next;
+    if (!loaded) return;
+    ready = true;
+    if (isEnded(job) && !shown) {
+      if (job.result?.event === "identified") keep({ ...job.result, search }, job);
+      else if (job.state === "failed") keep({ outcome: "failed", error: job.error, search }, job);
+    }
+    redraw();
+  },
+});
+on("hello", () => act(showLast));
 start();

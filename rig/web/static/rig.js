@@ -1,21 +1,22 @@
-// What all pages share: requests, events, the state of the bench, the lease and STOP.
+// What all pages share: requests, events, the state of the bench, the lease, STOP, jobs, dialogs and toasts.
 
 export const API = "/api/v1";
+// All tabs of a browser are one operator. A private window has a store of its own.
 const CLIENT = (() => {
-  let id = sessionStorage.getItem("rig-client");
+  let id = localStorage.getItem("rig-client");
   if (!id) {
     id = Array.from(crypto.getRandomValues(new Uint8Array(12)), (b) => b.toString(16).padStart(2, "0")).join("");
-    sessionStorage.setItem("rig-client", id);
+    localStorage.setItem("rig-client", id);
   }
   return id;
 })();
 
 export const $ = (id) => document.getElementById(id);
+const SVG = ["svg", "path", "rect", "circle", "line", "text", "g", "title", "polyline", "polygon"];
 
 /** Return a new element. Attributes are an object (on… are listeners), children are nodes or text. */
 export function h(tag, attributes = {}, ...children) {
-  const svg = ["path", "rect"].includes(tag);
-  const element = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  const element = SVG.includes(tag) ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   for (const [key, value] of Object.entries(attributes)) {
     if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
     else if (value !== false && value !== null && value !== undefined) element.setAttribute(key, value === true ? "" : value);
@@ -23,6 +24,8 @@ export function h(tag, attributes = {}, ...children) {
   element.append(...children.filter((child) => child !== null && child !== undefined && child !== false));
   return element;
 }
+
+// -- words -------------------------------------------------------------------------------------------------------------
 
 /** Return a number as people read it, with a minus sign; without decimals, with the digits that it has. */
 export function number(value, decimals = null) {
@@ -39,6 +42,24 @@ export function percent(probability) {
   return probability < 0.001 ? "<0.1 %" : `${(100 * probability).toFixed(1)} %`;
 }
 
+/** Return "a, b or c". */
+export const either = (words) => (words.length < 2 ? words.join("") : `${words.slice(0, -1).join(", ")} or ${words.at(-1)}`);
+
+/** Return a time as people read it: "43 s", "2 min 05 s", "1 h 20 min". */
+export function duration(seconds) {
+  const s = Math.round(seconds);
+  if (s < 60) return `${s} s`;
+  const two = (count) => String(count).padStart(2, "0");
+  return s < 3600 ? `${Math.floor(s / 60)} min ${two(s % 60)} s` : `${Math.floor(s / 3600)} h ${two(Math.floor((s % 3600) / 60))} min`;
+}
+
+const TIME = new Intl.DateTimeFormat(undefined, { hour: "2-digit", minute: "2-digit" });
+const DAY = new Intl.DateTimeFormat(undefined, { weekday: "short", day: "numeric", month: "short", year: "numeric" });
+export const timeOf = (utc) => TIME.format(new Date(utc));
+export const dayOf = (utc) => DAY.format(new Date(utc));
+/** Return a time in the zone of the browser, without the day if it is today. */
+export const when = (utc) => (dayOf(utc) === DAY.format(new Date()) ? timeOf(utc) : `${dayOf(utc)}, ${timeOf(utc)}`);
+
 const ACTIONS = JSON.parse($("actions").textContent);
 
 /** Return the next steps of an error: sentences, and buttons or links for what a page can do. */
@@ -53,6 +74,8 @@ export function nextSteps(steps = []) {
     return [step.command ? `${label}, at a terminal of the bench's computer: ` : `${label}. `, step.command && h("code", {}, step.command), " "];
   });
 }
+
+// -- requests ----------------------------------------------------------------------------------------------------------
 
 /** An error with the fields of the server's problem. */
 export class Problem extends Error {
@@ -90,6 +113,8 @@ export async function request(method, path, body) {
   if (!answer.ok) throw new Problem(values);
   return values;
 }
+export const get = (path) => request("GET", path);
+export const at = encodeURIComponent;
 
 /** Show an error until the next action. */
 export function show(problem) {
@@ -118,9 +143,11 @@ function valuesOf(form) {
   const value = (field) => {
     if (field.type === "checkbox") return field.checked;
     if (field.value === "") return null;
+    if (field.dataset.kind === "truth") return field.value === "true";
     return field.type === "number" ? Number(field.value) : field.value;
   };
-  return Object.fromEntries([...form.elements].filter((field) => field.name && !field.disabled).map((field) => [field.name, value(field)]));
+  const given = [...form.elements].filter((field) => field.name && !field.disabled && (field.type !== "radio" || field.checked));
+  return Object.fromEntries(given.map((field) => [field.name, value(field)]));
 }
 
 // A form or a button with data-job submits this kind of job. The names of the fields are the parameters of the job.
@@ -134,13 +161,43 @@ addEventListener("click", ({ target }) => {
   if (target.matches?.("button[data-job]")) submit({ kind: target.dataset.job });
 });
 
-// -- events -----------------------------------------------------------------------------------------------------------
+// -- dialogs and toasts ------------------------------------------------------------------------------------------------
+
+/** Ask a question, and return the value of the chosen button, or null. STOP can be used meanwhile. */
+export function ask(title, body, choices) {
+  return new Promise((resolve) => {
+    const buttons = choices.map(([value, label, kind]) => h("button", { class: kind, onclick: () => end(value) }, label));
+    const dialog = h("dialog", { "aria-labelledby": "dialog-title" }, h("h2", { id: "dialog-title" }, title), h("div", {}, ...[body].flat()), h("div", { class: "row wide" }, ...buttons, h("button", { class: "quiet", onclick: () => end(null) }, "Cancel")));
+    const before = document.activeElement;
+    function end(value) {
+      dialog.remove();
+      before?.focus?.();
+      resolve(value);
+    }
+    dialog.addEventListener("keydown", (event) => { if (event.key === "Escape") end(null); });
+    document.body.append(dialog);
+    dialog.show();
+    (dialog.querySelector("input, textarea") || buttons[0]).focus();
+  });
+}
+
+const TOAST_MS = 10000;
+/** Say what was done, with a button that undoes it. */
+export function toast(words, undo = null) {
+  const box = h("div", { class: "toast" }, h("span", {}, words));
+  if (undo) box.append(h("button", { onclick: () => { box.remove(); act(undo); } }, "Undo"));
+  box.append(h("button", { "aria-label": "Close the message", onclick: () => box.remove() }, "✕"));
+  $("toasts").append(box);
+  setTimeout(() => { if (!box.contains(document.activeElement)) box.remove(); }, TOAST_MS);
+}
+
+// -- events ------------------------------------------------------------------------------------------------------------
 
 const listeners = {};
 export function on(kind, listener) {
   (listeners[kind] ||= []).push(listener);
 }
-const dispatch = (kind, data) => (listeners[kind] || []).forEach((listener) => listener(data));
+const dispatch = (kind, data, id) => (listeners[kind] || []).forEach((listener) => listener(data, id));
 
 let socket = null;
 let lastId = null;
@@ -152,22 +209,21 @@ const RECONNECT_MS = 1500;
  */
 export function listen() {
   if (socket) return;
-  const after = lastId === null ? "" : `&last=${encodeURIComponent(lastId)}`;
+  const after = lastId === null ? "" : `&last=${at(lastId)}`;
   const mine = new WebSocket(`${location.origin.replace(/^http/, "ws")}${API}/socket?client=${CLIENT}${after}`);
   socket = mine;
   mine.onmessage = ({ data }) => {
     const message = JSON.parse(data);
     if (message.kind === "stopped") return takeAnswer(message.data);
     lastId = message.id;
-    return dispatch(message.kind, message.data);
+    return dispatch(message.kind, message.data, message.id);
   };
   mine.onclose = () => {
     if (socket !== mine) return; // this page was left
     socket = null;
-    $("state").textContent = "No connection to the server. Trying again …";
-    $("state").className = "state bad";
+    showState("No connection to the server. Trying again …", "bad");
     setTimeout(listen, RECONNECT_MS);
-    request("GET", "/me").catch(() => {}); // without a valid token, the browser shows the login page
+    get("/me").catch(() => {}); // without a valid token, the browser shows the login page
   };
 }
 addEventListener("pagehide", () => {
@@ -179,11 +235,16 @@ addEventListener("pageshow", (event) => {
   if (event.persisted) listen();
 });
 
-// -- state, lease, STOP -------------------------------------------------------------------------------------------------
+// -- state and lease ---------------------------------------------------------------------------------------------------
 
 let me = null;
 export const whoami = () => me;
 export const canOperate = () => me !== null && me.role === "operate";
+
+function showState(words, kind) {
+  $("state").textContent = words;
+  $("state").className = `state ${kind}`;
+}
 
 /** Return the state of the bench in words, and whether it is good or bad. */
 export function stateWords(status) {
@@ -191,7 +252,7 @@ export function stateWords(status) {
   if (status.fault) return [`Fault ${status.fault.code}: ${status.fault.what}`, "bad"];
   if (status.doubt) return [`The table's angle is in doubt: ${status.doubt}.`, "bad"];
   const angle = status.table_deg === null || status.table_deg === undefined ? "" : `, table at ${number(status.table_deg, 1)}°`;
-  return [`${status.job ? "Working" : "Ready"}${angle}`, "good"];
+  return [`${status.job ? "Working" : "Ready"}${angle}`, status.job ? "good busy" : "good"];
 }
 
 let stepsShown = "";
@@ -206,9 +267,7 @@ function showNextSteps(steps) {
 
 on("status", (status) => {
   showNextSteps((status.error ? status.error.steps : status.steps) || []);
-  const [words, kind] = stateWords(status);
-  $("state").textContent = words;
-  $("state").className = `state ${kind}`;
+  showState(...stateWords(status));
 });
 
 /** Say what the catalog's server does not have, and how old the local copy is. */
@@ -219,8 +278,10 @@ on("catalog", (state) => {
   $("catalog-state").replaceChildren(...words.map((text) => h("p", {}, text)));
 });
 
+$("menu")?.addEventListener("click", () => $("menu").setAttribute("aria-expanded", $("menu").getAttribute("aria-expanded") !== "true"));
+
 async function loadMe() {
-  me = await request("GET", "/me");
+  me = await get("/me");
   showLease(me.lease);
   dispatch("me", me);
 }
@@ -229,7 +290,8 @@ function showLease(lease) {
   const mine = lease.client === CLIENT && lease.holder === me.name;
   $("lease").textContent = mine ? `You operate (${me.name})` : lease.holder ? `${lease.holder} operates` : "No operator";
   $("lease-button").hidden = !canOperate();
-  $("lease-button").textContent = mine ? "Release the bench" : "Operate";
+  $("lease-button").textContent = mine ? "Release" : "Operate";
+  $("lease-button").setAttribute("aria-label", mine ? "Release the bench" : "Operate the bench");
   $("lease-button").dataset.mine = mine ? "1" : "";
 }
 
@@ -239,13 +301,9 @@ on("lease", (lease) => {
   if (lease.taken_from && lease.taken_from.name === me.name && lease.taken_from.client === CLIENT) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, steps: ["You can watch."] }));
 });
 
-function offerLease() {
-  $("lease-text").textContent = "Another operator uses the bench. If you take over, a running job continues, and the other operator sees a message.";
-  const dialog = $("lease-dialog");
-  dialog.onclose = () => {
-    if (dialog.returnValue === "force") act(() => request("POST", "/lease", { force: true }));
-  };
-  dialog.show();
+async function offerLease() {
+  const words = h("p", {}, "Another operator uses the bench. If you take over, a running job continues, and the other operator sees a message.");
+  if (await ask("Take over the bench?", words, [["force", "Take over", "danger"]])) act(() => request("POST", "/lease", { force: true }));
 }
 
 $("lease-button")?.addEventListener("click", () =>
@@ -255,7 +313,7 @@ setInterval(() => {
   if ($("lease-button")?.dataset.mine) request("POST", "/lease", {}).catch(() => {});
 }, 15000);
 
-// STOP. The page says what the bench has confirmed; without that it warns after a second.
+// -- STOP. The page says what the bench has confirmed; without that it warns after a second ------------------------------
 
 const WARN_MS = 1000;
 const SECOND_WAY_MS = 300;
@@ -308,91 +366,104 @@ on("stop", ({ ended, torque_off: torqueOff }) => {
   else if (pressedAt === null) showStop("Stopping …", "");
 });
 
-// -- a job ---------------------------------------------------------------------------------------------------------------
+// -- a job -------------------------------------------------------------------------------------------------------------
 
 const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", reference: "Set the angle", doctor: "Check the bench", calibrate: "Calibrate" };
 const ENDED = ["done", "failed", "cancelled", "interrupted"];
 const ACTIVE = ["running", "paused", "waiting"];
+const STATES = { queued: "waits for the bench", waiting: "waits for you", failed: "not finished", cancelled: "stopped" };
 const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "Stop" };
+export const isEnded = (job) => ENDED.includes(job.state);
 
-function jobTitle(job) {
+export function jobTitle(job) {
   const request_ = job.request;
   const what = request_.name || (request_.angle_deg !== undefined ? `to ${number(request_.angle_deg)}°` : "");
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
 }
 
-/** Return a time as people read it: "43 s", "2 min 05 s", "1 h 20 min". */
-export function duration(seconds) {
-  const s = Math.round(seconds);
-  if (s < 60) return `${s} s`;
-  const two = (count) => String(count).padStart(2, "0");
-  return s < 3600 ? `${Math.floor(s / 60)} min ${two(s % 60)} s` : `${Math.floor(s / 3600)} h ${two(Math.floor((s % 3600) / 60))} min`;
-}
-
 /** Show a job in a box: progress, question, buttons and, unless the page shows it elsewhere, the outcome. */
-function showJob(box, job, withOutcome = true) {
+export function showJob(box, job, withOutcome = true) {
   if (!job) return box.replaceChildren();
   const post = (what, body) => () => act(() => request("POST", `/jobs/${job.id}/${what}`, body));
-  const parts = [h("p", {}, h("strong", {}, jobTitle(job)), ` – ${job.state}`)];
-  const ended = ENDED.includes(job.state);
-  if (job.progress && job.progress.total && !ended) {
+  const parts = [];
+  if (!isEnded(job) || withOutcome) parts.push(h("p", {}, h("strong", {}, jobTitle(job)), ` – ${STATES[job.state] || job.state}`));
+  if (job.progress && job.progress.total && !isEnded(job)) {
     const left = job.progress.seconds_left;
     const words = `${job.progress.done} of ${job.progress.total}${left ? `, about ${duration(left)} left` : ""}`;
-    parts.push(h("progress", { max: job.progress.total, value: job.progress.done, "aria-label": words }), h("p", {}, words));
+    parts.push(h("progress", { max: job.progress.total, value: job.progress.done, "aria-label": words }), h("p", { class: "soft" }, words));
   }
   if (job.question) {
-    const buttons = job.question.choices.map((choice) => h("button", { class: choice === "continue" ? "big" : "quiet", onclick: post("answer", { choice }) }, CHOICES[choice]));
-    parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), h("p", {}, ...nextSteps(job.question.steps)), h("div", { class: "row" }, ...buttons)));
+    const sample = job.question.asks === "sample" ? h("input", { "aria-label": "Sample", maxlength: 100, autocomplete: "off", onkeydown: (event) => { if (event.key === "Enter") post("answer", { choice: "continue", sample: event.target.value || null })(); } }) : null;
+    const buttons = job.question.choices.map((choice) => h("button", { class: choice === "continue" ? "" : "quiet", onclick: () => post("answer", sample && choice === "continue" ? { choice, sample: sample.value || null } : { choice })() }, CHOICES[choice]));
+    parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), sample, h("p", {}, ...nextSteps(job.question.steps)), h("div", { class: "row" }, ...buttons)));
   }
-  if (!ended) {
+  if (!isEnded(job)) {
     parts.push(
       h("div", { class: "row" },
         job.state === "running" && h("button", { class: "quiet", onclick: post("pause") }, "Pause"),
         job.state === "paused" && h("button", { onclick: post("resume") }, "Resume"),
-        h("button", { class: "quiet", onclick: post("cancel") }, "Cancel")),
+        h("button", { class: "quiet", onclick: post("cancel") }, job.request.watch ? "Finish" : "Cancel")),
     );
   }
   if (withOutcome && job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
-  if (withOutcome && job.error) parts.push(h("p", { class: "error" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, "Next step: ", ...nextSteps(job.error.steps)));
-  if (job.resume) {
-    parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
-  }
+  if (withOutcome && job.error) parts.push(h("div", { class: "failure" }, h("p", { class: "error" }, job.error.what), h("p", {}, ...nextSteps(job.error.steps)), h("p", { class: "small soft" }, `Error ${job.error.code}`)));
+  if (job.resume && withOutcome) parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
   box.replaceChildren(...parts);
+  if (job.question?.asks === "sample") box.querySelector(".question input").focus();
   return undefined;
 }
 
-const loadJobs = async () => (await request("GET", "/jobs?limit=50")).items;
-const newestOf = (jobs) => jobs.find((job) => ACTIVE.includes(job.state)) || jobs[0];
+const loadJobs = async () => (await get("/jobs?limit=50")).items;
+export const newestOf = (jobs) => jobs.find((job) => ACTIVE.includes(job.state)) || jobs[0];
+
+/** Return the events of a job so far, and the id of the last one; of an old identification those of its saved run. */
+async function eventsOf(job) {
+  const found = await get(`/jobs/${job.id}/events`);
+  if (found.items.length || !job.run || !isEnded(job)) return found;
+  const run = await get(`/runs/${job.run}`).catch(() => ({ events: [] }));
+  return { ...found, items: run.events };
+}
+const placeOf = (id) => Number(id.split("-").at(-1));
 
 /**
- * Show the newest job of these kinds: its state, its views and, where `withOutcome` allows it, its outcome. Call `changed`
- * with it, and whether it is another one.
+ * Follow the newest job of these kinds. A page that is opened later sees the same as one that was open all the time:
+ * `begin(job)`, then `event(event, job)` for all its events, and `render(job, loaded)` when the page has to change.
  */
-export function followJobs(kinds, changed = () => {}, viewWords = null, withOutcome = () => true) {
+export function followJob(kinds, { begin, event, render }) {
   let shown = null;
-  const add = (number, words) => $("thumbs").append(h("li", {}, h("img", { src: `${API}/jobs/${shown.id}/views/${number}`, alt: "", loading: "lazy" }), words));
-  const take = (job) => {
-    const isOther = !shown || shown.id !== job.id;
-    if (!kinds.includes(job.request.kind)) return;
-    if (shown && isOther && (job.created_utc < shown.created_utc || (job.state === "queued" && !ENDED.includes(shown.state)))) return;
+  let waiting = null; // events that came while those before them are loaded
+  async function open(job) {
     shown = job;
-    showJob($("job"), job, withOutcome(job));
-    if (isOther && viewWords) { // a page that was opened in the middle of a job shows the views so far
-      $("thumbs").replaceChildren();
-      for (let k = 0; k < job.views; k += 1) add(k, `view ${k + 1}`);
-    }
-    changed(job, isOther);
-  };
+    waiting = [];
+    begin(job);
+    render(job, false);
+    const { items, last } = await eventsOf(job).catch(() => ({ items: [], last: "0" }));
+    if (shown.id !== job.id) return;
+    for (const one of items) event(one, shown);
+    for (const [one, id] of waiting) if (placeOf(id) > placeOf(last)) event(one, shown);
+    waiting = null;
+    render(shown, true);
+  }
+  function take(job) {
+    if (!kinds.includes(job.request.kind)) return;
+    if (shown?.id === job.id) {
+      shown = job;
+      render(job, !waiting);
+    } else if (!shown || (job.created_utc >= shown.created_utc && (job.state !== "queued" || isEnded(shown)))) open(job);
+  }
   on("job", take);
   on("hello", () => act(async () => {
     const newest = newestOf((await loadJobs()).filter((job) => kinds.includes(job.request.kind)));
-    if (newest) take(newest);
+    shown = null;
+    if (newest) await open(newest);
   }));
-  on("plan", (event) => {
-    if (event.job !== shown?.id) return;
-    if (viewWords && event.event === "started") $("thumbs").replaceChildren();
-    if (viewWords && event.event === "accepted") add(event.picture, viewWords(event));
-    dispatch("shown-plan", event);
+  on("plan", (one, id) => {
+    if (one.job !== shown?.id) return;
+    if (waiting) waiting.push([one, id]);
+    else {
+      event(one, shown);
+      render(shown, true);
+    }
   });
 }
 
@@ -406,7 +477,7 @@ export function listJobs(changed) {
     showJob($("job"), chosen);
     if (chosen) changed(chosen);
     $("jobs").replaceChildren(
-      ...newest.slice(0, 12).map((job) => h("li", {}, h("button", { class: "quiet", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${job.state}, ${job.operator}, ${job.created_utc}`)),
+      ...newest.slice(0, 8).map((job) => h("li", {}, h("button", { class: "link", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${STATES[job.state] || job.state}, ${when(job.created_utc)}, ${job.operator}`)),
     );
   };
   on("job", (job) => {
@@ -424,7 +495,7 @@ export function listJobs(changed) {
 export function pager(path, add) {
   let next = null;
   const load = async (more) => {
-    const page = await request("GET", path() + (more ? `&after=${encodeURIComponent(next)}` : ""));
+    const page = await get(path() + (more ? `&after=${at(next)}` : ""));
     next = page.next;
     $("more").hidden = next === null;
     add(page, !more);
@@ -433,19 +504,24 @@ export function pager(path, add) {
   return () => load(false);
 }
 
-
 export function table(element, head, rows) {
   element.replaceChildren(
-    h("thead", {}, h("tr", {}, ...head.map((text) => h("th", { scope: "col" }, text)))),
+    h("thead", {}, h("tr", {}, ...head.map((text) => (text ? h("th", { scope: "col" }, text) : h("td", {}))))),
     h("tbody", {}, ...rows.map((row) => h("tr", {}, ...row.map((cell) => h("td", {}, cell instanceof Node ? cell : String(cell ?? "")))))),
   );
+}
+
+/** Keep a choice of this browser: a check box, and whether it is ticked. */
+export function remembered(box, key) {
+  box.checked = localStorage.getItem(key) === "1";
+  box.addEventListener("change", () => localStorage.setItem(key, box.checked ? "1" : ""));
 }
 
 export async function start() {
   await act(loadMe); // without a valid token, the browser shows the login page
   on("hello", () => act(async () => {
     await loadMe();
-    const status = await request("GET", "/status");
+    const status = await get("/status");
     dispatch("status", status);
     dispatch("catalog", status.catalog);
   }));

@@ -1,0 +1,108 @@
+"""The REST API: pictures for people: an enrolled object at a pose, its silhouette, and where two objects differ."""
+
+from typing import Annotated, Final
+
+from fastapi import Query, Request, Response
+from pydantic import BaseModel
+
+import hbr
+from hbr.core.angles import wrap180
+from rig.catalog import Catalog, View
+from rig.catalog.derived import silhouette, views
+from rig.core.errors import JobNotFound
+from rig.views.description import BENCH_DESCRIPTOR, within
+from rig.web.answers import Jpeg
+from rig.web.api_catalog import Number
+from rig.web.picture import jpeg, outlines_of
+from rig.web.server import Routes, Server, cached
+
+PICTURE_PX: Final = 720  # half of a tablet's screen; larger: a page with eight of them loads slowly
+Object = Annotated[str, Query(alias="object", max_length=100, description="name of an enrolled object")]
+Azimuth = Annotated[float, Query(allow_inf_nan=False, description="of the camera around the object, in degrees")]
+
+
+class Pair(BaseModel):
+    """A view of an object, the view of the other object that looks most like it, and their similarity from 0 to 1."""
+
+    view: int
+    azimuth_deg: float
+    other_view: int
+    other_azimuth_deg: float
+    similarity: float
+
+
+class Pairs(BaseModel):
+    """The views at which two objects look most alike, and at which they differ most."""
+
+    alike: Pair
+    different: Pair
+
+
+class Silhouette(BaseModel):
+    """The outlines of the object in the picture of a view of this size, in pixels."""
+
+    width: int
+    height: int
+    points: list[list[list[int]]]
+
+
+def add_pictures(routes: Routes, server: Server) -> None:
+    def sent(request: Request, catalog: Catalog, view: View) -> Response:
+        def answer() -> Response:
+            return Jpeg(jpeg(within(catalog.read_image(view.image), view.region), PICTURE_PX))
+
+        return cached(request, f"{view.image}-{PICTURE_PX}", answer, {"Cache-Control": "private, max-age=86400"})
+
+    @routes.watch.get("/views/{view_id}/picture", tags=["catalog"], response_class=Jpeg)
+    def get_view_picture(request: Request, view_id: Number) -> Response:
+        """Return the region of a view that is described, as JPEG for the eye."""
+        with server.catalog.open_to_read() as catalog:
+            return sent(request, catalog, catalog.view(view_id))
+
+    @routes.watch.get("/pose-picture", tags=["catalog"], response_class=Jpeg)
+    def get_pose_picture(request: Request, object_name: Object, azimuth_deg: Azimuth = 0.0) -> Response:
+        """Return the enrolled view of an object that is nearest to an azimuth, as JPEG for the eye."""
+        with server.catalog.open_to_read() as catalog:
+            found = catalog.object(object_name).views
+            if not found:
+                raise _not_enrolled(object_name)
+            return sent(request, catalog, min(found, key=lambda view: abs(wrap180(view.azimuth_deg - azimuth_deg))))
+
+    @routes.watch.get("/silhouette", tags=["catalog"])
+    def get_silhouette(object_name: Object, index: Annotated[int, Query(ge=0, lt=10_000)]) -> Silhouette:
+        """Return the silhouette of an object in one of its views, as the description uses it; ``index`` from 0."""
+        with server.catalog.open_to_read() as catalog:
+            mask = silhouette(catalog, object_name, index)
+        height, width = mask.shape
+        return Silhouette(width=width, height=height, points=outlines_of(mask))
+
+    @routes.watch.get("/pairs", tags=["catalog"])
+    def get_pairs(object_name: Object, other: Annotated[str, Query(max_length=100)]) -> Pairs:
+        """Return where two objects look most alike, and where they differ most, by the similarity of their views."""
+        with server.catalog.open_to_read() as catalog:
+            one, two = (catalog.object(name) for name in (object_name, other))
+            known = views(catalog, BENCH_DESCRIPTOR)
+        for item in (one, two):
+            if not item.views:
+                raise _not_enrolled(item.summary.name)
+        numbers = [known.object_names.index(item.summary.name) for item in (one, two)]
+        own, others = (known.select(known.object_index == number).descriptors for number in numbers)
+        similar = hbr.tanimoto(own, others)
+        best = similar.argmax(axis=1)
+        value = similar.max(axis=1)
+
+        def pair(at: int) -> Pair:
+            first, second = one.views[at], two.views[int(best[at])]
+            return Pair(
+                view=first.id,
+                azimuth_deg=first.azimuth_deg,
+                other_view=second.id,
+                other_azimuth_deg=second.azimuth_deg,
+                similarity=float(value[at]),
+            )
+
+        return Pairs(alike=pair(int(value.argmax())), different=pair(int(value.argmin())))
+
+
+def _not_enrolled(name: str) -> JobNotFound:
+    return JobNotFound(f"{name!r} has no complete enrollment.", next_step="Choose one of GET /api/v1/objects.")

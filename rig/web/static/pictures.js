@@ -1,0 +1,185 @@
+// Pictures and charts: the live image, an object that turns, pairs of pictures, the path of a search, lines and columns.
+import { API, at, duration, h, number, on } from "./rig.js";
+
+export const viewPicture = (id) => `${API}/views/${id}/picture`;
+export const posePicture = (name, azimuthDeg = 0) => `${API}/pose-picture?object=${at(name)}&azimuth_deg=${azimuthDeg.toFixed(1)}`;
+
+/** Return a picture with words below it. */
+export function picture(source, alt, ...words) {
+  return h("figure", {}, h("div", { class: "frame" }, h("img", { src: source, alt })), words.length > 0 && h("figcaption", {}, ...words));
+}
+
+// -- the live image: one short request after the other. An endless one would occupy one of the browser's few connections ---
+
+const PICTURE_MS = 200;
+const STALE_S = 3;
+
+/** The live image, cut to the region that is described; with its age, and a mark when no new one comes. */
+class RigLive extends HTMLElement {
+  takenAt = null;
+
+  connectedCallback() {
+    this.image = h("img", { id: "live-image", class: "whole", alt: "Live image of the table" });
+    this.outline = h("svg", { id: "outline", "aria-hidden": "true" });
+    this.age = h("p", { id: "live-age", role: "status", hidden: true });
+    this.frame = h("div", { class: "picture", id: "live" }, this.image, this.outline, this.age);
+    this.append(this.frame);
+    this.image.addEventListener("load", () => this.fit());
+    on("status", (status) => { if (status.open) { this.region = status.region; this.fit(); } });
+    on("plan", (event) => {
+      if (event.event === "accepted" && event.outline_px) this.draw(event.outline_px);
+      if (event.event === "moved" || event.event === "waiting" || event.event === "started") this.outline.replaceChildren();
+    });
+    this.fetchAll();
+    setInterval(() => this.mark(), 500);
+  }
+
+  /** Show the region of interest only, unless the whole frame is wanted. */
+  fit() {
+    const { naturalWidth: width, naturalHeight: height } = this.image;
+    if (!width) return;
+    const [x, y, w, tall] = (!this.hasAttribute("whole") && this.region) || [0, 0, width, height];
+    const style = this.image.style;
+    this.frame.style.aspectRatio = `${w} / ${tall}`;
+    [style.width, style.height] = [`${(100 * width) / w}%`, `${(100 * height) / tall}%`];
+    [style.left, style.top] = [`${(-100 * x) / w}%`, `${(-100 * y) / tall}%`];
+    style.maxWidth = "none";
+    this.outline.setAttribute("viewBox", `${x} ${y} ${w} ${tall}`);
+  }
+
+  /** Draw the outline of the object. */
+  draw(found) {
+    const path = found.points.map(([x, y], k) => `${k ? "L" : "M"}${x} ${y}`).join(" ");
+    this.outline.replaceChildren(h("path", { d: `${path} Z`, fill: "none", stroke: "#ffd34d", "stroke-width": 2, "vector-effect": "non-scaling-stroke" }));
+  }
+
+  async fetchOne() {
+    const answer = await fetch(`${API}/picture`, { cache: "no-store" });
+    if (!answer.ok) return;
+    this.takenAt = performance.now() - 1000 * Number(answer.headers.get("X-Rig-Picture-Age"));
+    const before = this.image.src;
+    this.image.src = URL.createObjectURL(await answer.blob());
+    if (before.startsWith("blob:")) URL.revokeObjectURL(before);
+  }
+
+  async fetchAll() {
+    if (!document.hidden) await this.fetchOne().catch(() => {}); // the line of the state says that the server does not answer
+    setTimeout(() => this.fetchAll(), document.hidden ? 1000 : PICTURE_MS);
+  }
+
+  /** Mark an old picture: the camera may be unplugged, or the bench may not answer. */
+  mark() {
+    const age = this.takenAt === null ? null : (performance.now() - this.takenAt) / 1000;
+    const stale = age === null || age > STALE_S;
+    this.frame.classList.toggle("stale", stale);
+    this.age.hidden = !stale;
+    this.age.textContent = age === null ? "No image from the camera yet." : `This image is ${duration(age)} old: no new one comes.`;
+  }
+}
+customElements.define("rig-live", RigLive);
+
+// -- an object that turns ------------------------------------------------------------------------------------------------
+
+/** The enrolled views of an object: drag, use the slider or the arrow keys to turn it. It tells which view is shown. */
+class RigTurn extends HTMLElement {
+  show(name, views) {
+    this.views = [...views].sort((a, b) => a.azimuth_deg - b.azimuth_deg);
+    this.image = h("img", { alt: `${name}, turned`, draggable: "false" });
+    this.overlay = h("svg", { "aria-hidden": "true" });
+    this.words = h("p", { class: "number" });
+    this.slider = h("input", { type: "range", min: 0, max: this.views.length - 1, step: 1, "aria-label": "Side of the object", oninput: () => this.turn(Number(this.slider.value)) });
+    const frame = h("div", { class: "picture", style: "cursor: grab; touch-action: pan-y" }, this.image, this.overlay);
+    this.replaceChildren(frame, this.slider, this.words);
+    frame.addEventListener("pointerdown", (event) => {
+      const [from, first] = [event.clientX, this.place];
+      frame.setPointerCapture(event.pointerId);
+      frame.onpointermove = (move) => this.turn(first + Math.round(((move.clientX - from) / frame.clientWidth) * this.views.length));
+      frame.onpointerup = () => { frame.onpointermove = null; };
+      frame.onpointercancel = frame.onpointerup;
+    });
+    for (const view of this.views) new Image().src = viewPicture(view.id); // so that it turns without waiting
+    this.turn(0);
+  }
+
+  turn(place) {
+    const count = this.views.length;
+    this.place = ((place % count) + count) % count;
+    const view = this.views[this.place];
+    this.image.src = viewPicture(view.id);
+    this.slider.value = this.place;
+    this.slider.setAttribute("aria-valuetext", `${view.azimuth_deg.toFixed(0)}°`);
+    this.words.textContent = `${view.azimuth_deg.toFixed(0)}°`;
+    this.overlay.replaceChildren();
+    this.dispatchEvent(new CustomEvent("turn", { detail: view }));
+  }
+
+  /** Draw a silhouette over the picture: its points, and the size of the picture that they belong to. */
+  silhouette({ points, width, height }) {
+    this.overlay.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    this.overlay.replaceChildren(...points.map((part) => h("polygon", { points: part.map((point) => point.join(",")).join(" "), fill: "none", stroke: "#ffd34d", "stroke-width": 2, "vector-effect": "non-scaling-stroke" })));
+  }
+}
+customElements.define("rig-turn", RigTurn);
+
+// -- charts --------------------------------------------------------------------------------------------------------------
+
+const point = (radius, degrees) => {
+  const angle = (degrees * Math.PI) / 180;
+  return [100 - radius * Math.sin(angle), 100 - radius * Math.cos(angle)];
+};
+
+/** Return a small drawing of the camera's way around the object, seen from above: 0° at the top, counter-clockwise. */
+export function pathDrawing(azimuths) {
+  const parts = [h("circle", { cx: 100, cy: 100, r: 82, class: "rim" }), h("circle", { cx: 100, cy: 100, r: 16, class: "seen", opacity: 0.25 })];
+  const step = Math.min(12, 40 / Math.max(azimuths.length, 1));
+  azimuths.forEach((azimuth, k) => {
+    if (k) {
+      const before = azimuths[k - 1];
+      const turn = ((azimuth - before + 540) % 360) - 180;
+      const arc = Array.from({ length: 25 }, (_, n) => point(38 + step * (k - 1 + n / 24), before + (turn * n) / 24));
+      parts.push(h("path", { class: "step", d: arc.map(([x, y], n) => `${n ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("") }));
+    }
+  });
+  azimuths.forEach((azimuth, k) => {
+    const [x, y] = point(38 + step * k, azimuth);
+    parts.push(h("circle", { cx: x, cy: y, r: 11, class: "stop" }), h("text", { x, y: y + 5, "text-anchor": "middle", class: "stop-number" }, String(k + 1)));
+  });
+  const label = azimuths.length ? `The camera's way around the object: ${azimuths.map((one) => `${one.toFixed(0)}°`).join(", ")}` : "No view yet";
+  return h("svg", { viewBox: "0 0 200 200", class: "chart", role: "img", "aria-label": label }, ...parts);
+}
+
+/** Return a chart of lines: `series` have a name, a class for the colour, and points [x, y]; y may be null. */
+export function lineChart(series, { label, unit = "", high = 150, zero = false }) {
+  const all = series.flatMap((one) => one.points).filter(([, y]) => y !== null && y !== undefined);
+  if (!all.length) return h("p", { class: "soft" }, "Nothing to show yet.");
+  const [xs, ys] = [all.map(([x]) => x), all.map(([, y]) => y)];
+  let [low, top] = [Math.min(...ys, ...(zero ? [0] : [])), Math.max(...ys, ...(zero ? [0] : []))];
+  if (top - low < 1e-9) [low, top] = [low - 1, top + 1];
+  const [x0, x1] = [Math.min(...xs), Math.max(...xs)];
+  const X = (x) => 48 + (460 * (x - x0)) / (x1 - x0 || 1);
+  const Y = (y) => 12 + ((high - 30) * (top - y)) / (top - low);
+  const parts = [low, top].flatMap((y) => [h("line", { x1: 48, x2: 508, y1: Y(y), y2: Y(y), class: "grid" }), h("text", { x: 42, y: Y(y) + 4, "text-anchor": "end", class: "axis" }, `${number(y, Math.abs(top - low) < 3 ? 1 : 0)}${unit}`)]);
+  for (const one of series) {
+    let pen = "M";
+    const d = one.points.map(([x, y]) => { if (y === null || y === undefined) { pen = "M"; return ""; } const text = `${pen}${X(x).toFixed(1)} ${Y(y).toFixed(1)}`; pen = "L"; return text; }).join("");
+    parts.push(h("path", { d, class: `curve ${one.colour}${one.dashed ? " dashed" : ""}` }));
+  }
+  const key = h("p", { class: "small" }, ...series.flatMap((one) => [h("span", { class: one.colour }, "━ "), `${one.name}   `]));
+  return h("div", {}, h("svg", { viewBox: `0 0 520 ${high}`, class: "chart", role: "img", "aria-label": label }, ...parts), series.length > 1 && key);
+}
+
+/** Return a chart of columns: rows of [label, value, share], the share of the value in another colour. */
+export function columnChart(rows, label) {
+  const most = Math.max(1, ...rows.map(([, value]) => value));
+  const width = 480 / Math.max(rows.length, 7);
+  const parts = rows.flatMap(([name, value, share], k) => {
+    const [x, tall] = [20 + k * width, (90 * value) / most];
+    return [
+      h("rect", { x, y: 104 - tall, width: width * 0.7, height: tall, rx: 3, fill: "currentColor", class: "c0" }),
+      share > 0 && h("rect", { x, y: 104 - (90 * share) / most, width: width * 0.7, height: (90 * share) / most, rx: 3, fill: "currentColor", class: "c1" }),
+      h("text", { x: x + width * 0.35, y: 98 - tall, "text-anchor": "middle", class: "small" }, String(value)),
+      h("text", { x: x + width * 0.35, y: 120, "text-anchor": "middle", class: "axis" }, name),
+    ].filter(Boolean);
+  });
+  return h("svg", { viewBox: "0 -8 520 134", class: "chart", role: "img", "aria-label": label }, ...parts);
+}
