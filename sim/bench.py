@@ -1,11 +1,11 @@
 """The simulated bench: one simulated world, and the real drivers connected to simulated devices."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from pydantic import BaseModel, Field, field_validator
 
@@ -27,10 +27,14 @@ from sim.devices import SimDevices
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
 from sim.noise import NoiseModel
-from sim.objects.projection import Image
+from sim.objects.projection import Image, Visible
 from sim.objects.shelf import shelf
+from sim.objects.solid import empty_platter
 from sim.optics import Optics
 from sim.world import SimObject, World
+
+_UNPLUGGED_S: Final = 8  # long enough to see what the pages say
+_SHOWN_DEG: Final = 25.0  # most objects show their handle and their picture from there
 
 
 class SimOptions(Section):
@@ -172,6 +176,54 @@ class ShelfOperator:
         return True
 
 
+class SimShelf:
+    """The shelf of a simulated bench: a person at a page puts its objects on the table, and changes the bench."""
+
+    def __init__(self, operator: ShelfOperator) -> None:
+        self._operator = operator
+
+    @property
+    def things(self) -> list[str]:
+        return list(self._operator.objects)
+
+    def picture(self, name: str) -> Image:
+        """Return a picture of an object on the platter, uint8 (480, 480, 3)."""
+        thing, image = self._operator.thing(name, to_identify=False), empty_platter()
+        assert isinstance(thing, Visible)
+        thing.draw(image, _SHOWN_DEG, (0.0, 0.0))
+        return image[:, 80:560]
+
+    def state(self) -> dict[str, Any]:
+        scene, faults = self._operator.world.scene, self._operator.faults
+        return {
+            "object": scene.object.name if scene.object else None,
+            "light": scene.light[0],
+            "faults": [fault.kind.name for fault in faults.active] if faults else [],
+        }
+
+    def do(self, words: Sequence[str]) -> None:
+        """Put an object on the table in any orientation, clear the table, set the light, or unplug the camera a while.
+
+        Raises `UsageError`, `ObjectNotFound`: there is no such thing to do, or no such object.
+        """
+        operator = self._operator
+        match words:
+            case ["put", name]:
+                operator.world.put(None)
+                operator.next_object = operator.thing(name, to_identify=True).name
+                operator.place(None)
+            case ["clear"]:
+                operator.world.put(None)
+            case ["light", ("0.25" | "0.5" | "1" | "1.5") as factor]:
+                operator.world.change(light=(float(factor),) * 3)
+            case ["unplug"] if operator.faults is not None:
+                operator.faults.schedule(
+                    Fault.parse(f"camera.off@{operator.world.clock.now_ns() * 1e-9}s+{_UNPLUGGED_S}s")
+                )
+            case _:
+                raise UsageError("Hands cannot do that.", next_step="put NAME, clear, light 0.5, or unplug.")
+
+
 def open_sim_bench(
     config: RigConfig,
     operator: ShelfOperator,
@@ -288,6 +340,7 @@ class SimBenchKind(BenchKind):
                 stage.config, operator, faults=map(Fault.parse, options.faults), open_now=(), name=self.name
             )
             bench.findings += stage.findings
+            bench.shelf = SimShelf(operator) if options.object is None else None
             bench.connections.enter_context(held.pop_all())
         return bench
 

@@ -4,7 +4,7 @@ Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
@@ -12,6 +12,8 @@ from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from rig.bench.computer import Computer
@@ -47,6 +49,23 @@ class Placer(Protocol):
         """Return True when the table is empty; False if that is not possible."""
 
 
+class Shelf(Protocol):
+    """What hands do at a simulated bench. A page lets a person do it, who then is the one who places the objects."""
+
+    @property
+    def things(self) -> Sequence[str]:
+        """The objects that can be put on the table."""
+
+    def picture(self, name: str) -> NDArray[np.uint8]:
+        """Return a picture of an object, BGR. Raises `ObjectNotFound`."""
+
+    def state(self) -> dict[str, Any]:
+        """Return what is on the table, the light and the faults, as plain data."""
+
+    def do(self, words: Sequence[str]) -> None:
+        """Do something by hand. Raises `UsageError`: it is not possible."""
+
+
 @dataclass(slots=True)
 class Bench(AbstractContextManager["Bench"]):
     """The devices of one bench, on one clock. IMU and camera are opened at their first use, or by `open_devices`.
@@ -57,6 +76,8 @@ class Bench(AbstractContextManager["Bench"]):
         Open the device; `imu` and `camera` call them once.
     placer
         Puts objects on the table; None if a person does that, before a plan begins.
+    shelf
+        The hands of a simulated bench; None if the bench is a real one, or its objects are placed by a script.
     conditions
         The noise model or the calibrations in force; stored with every enrollment.
     findings
@@ -82,6 +103,7 @@ class Bench(AbstractContextManager["Bench"]):
     open_imu: Callable[[], Imu] = field(repr=False)
     open_camera: Callable[[], Camera] = field(repr=False)
     placer: Placer | None = None
+    shelf: Shelf | None = None
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     calibration_findings: tuple[str, ...] = field(default=(), init=False)

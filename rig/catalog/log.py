@@ -8,6 +8,7 @@ import pwd
 import re
 import socket
 from collections.abc import Iterator
+from contextvars import ContextVar
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
@@ -32,6 +33,8 @@ _ENDS: Final = (
     select(func.max(Entry.id)),
     *(select(func.count()).where(column.is_not(None)) for column in _COUNTED),
 )
+OPERATOR: Final[ContextVar[str | None]] = ContextVar("operator", default=None)
+"""Who asks for the changes, if it is not the account that makes them: the person at a page of a server."""
 _COLUMNS: Final = tuple(column.name for column in Entry.__table__.columns)
 
 
@@ -39,7 +42,8 @@ def append(
     transaction: Transaction, clock: Clock, action: Action, object_name: str | None = None, **columns: Any
 ) -> Entry:
     """Add a line to the log, with these other columns of `Entry`, and return it."""
-    details = as_json(columns.pop("details", {}), "The details of the log entry")
+    operator = {"operator": OPERATOR.get()} if OPERATOR.get() else {}
+    details = as_json({**operator, **columns.pop("details", {})}, "The details of the log entry")
     entry = Entry(
         id=0, time_utc=clock.utc(), **author(), action=action, object_name=object_name, details=details, **columns
     )

@@ -25,7 +25,7 @@ from rig.web.answers import (
     Svg,
 )
 from rig.web.hub import MAX_LISTENERS
-from rig.web.requests import AnswerBody, GotoRequest, Job, JobRequest, LeaseBody, LoginBody
+from rig.web.requests import AnswerBody, ByHand, GotoRequest, Job, JobRequest, LeaseBody, LoginBody
 from rig.web.server import API, COOKIE, OperatorPerson, Page, Proposer, Routes, Server, Watcher, require_operate, schemes
 
 IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
@@ -222,3 +222,26 @@ def add_jobs(routes: Routes, server: Server) -> None:
         events, last = server.hub.of_job(job_id)
         content = f'{{"items": [{", ".join(events)}], "last": "{last}"}}'
         return Response(content, media_type="application/json", headers={"Cache-Control": "no-store"})
+
+
+def add_shelf(routes: Routes, server: Server) -> None:
+    """Add the routes for the hands at a simulated bench; other benches answer 404."""
+
+    @routes.watch.get("/shelf", tags=["bench"])
+    def get_shelf() -> dict[str, Any]:
+        """Return the objects of a simulated bench, and what is on its table."""
+        state: dict[str, Any] = server.remote.call("shelf")
+        return state
+
+    @routes.operate.post("/shelf", tags=["bench"])
+    def use_shelf(body: ByHand) -> dict[str, Any]:
+        """Do something by hand at a simulated bench; the event `shelf` says what was done."""
+        state: dict[str, Any] = server.remote.call("by_hand", words=body.words)
+        return state
+
+    @routes.watch.get("/shelf/{name}", tags=["bench"], response_class=Jpeg)
+    def get_thing(name: str) -> Jpeg:
+        """Return a picture of an object of a simulated bench as JPEG."""
+        return Jpeg(
+            b64decode(server.remote.call("thing", thing=name)), headers={"Cache-Control": "private, max-age=3600"}
+        )

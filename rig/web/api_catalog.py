@@ -95,25 +95,25 @@ def add_objects(routes: Routes, server: Server) -> None:
         )
 
     @routes.operate.patch("/objects/{name:path}", tags=["catalog"])
-    def change_object(name: str, body: ObjectBody) -> ObjectRow:
+    def change_object(name: str, body: ObjectBody, person: OperatorPerson) -> ObjectRow:
         """Rename or label an object."""
-        with server.catalog.open_to_change() as catalog:
+        with server.catalog.open_to_change(person) as catalog:
             catalog.set_texts(name, label=body.label, note=body.note)
             if body.name is not None:
                 catalog.rename(name, body.name)
             return ObjectRow.model_validate(catalog.summary(body.name or name))
 
     @routes.operate.delete("/objects/{name:path}", tags=["catalog"])
-    def delete_object(name: str) -> Deleted:
+    def delete_object(name: str, person: OperatorPerson) -> Deleted:
         """Delete an object. It can be restored until rig catalog gc removes it."""
-        with server.catalog.open_to_change() as catalog:
+        with server.catalog.open_to_change(person) as catalog:
             catalog.delete(name)
         return Deleted(deleted=name)
 
     @routes.operate.post("/undelete", tags=["catalog"])
-    def restore_object(body: NameBody) -> ObjectRow:
+    def restore_object(body: NameBody, person: OperatorPerson) -> ObjectRow:
         """Restore a deleted object."""
-        with server.catalog.open_to_change() as catalog:
+        with server.catalog.open_to_change(person) as catalog:
             catalog.undelete(body.name)
             return ObjectRow.model_validate(catalog.summary(body.name))
 
@@ -195,7 +195,7 @@ def add_results(routes: Routes, server: Server) -> None:
     @routes.operate.post("/results/{result_id}/correct", tags=["results"])
     def correct_result(body: CorrectionBody, person: OperatorPerson, result_id: Number) -> dict[str, Any]:
         """Correct the object or the sample of an answer, with the reason. The answer itself stays."""
-        with server.catalog.open_to_change() as catalog:
+        with server.catalog.open_to_change(person) as catalog:
             _result(catalog, result_id)
             correct(
                 catalog,
@@ -241,11 +241,13 @@ def add_bundles(routes: Routes, server: Server) -> None:
     download = _Download()
 
     @routes.operate.post("/import", tags=["catalog"])
-    async def import_bundle(request: Request, on_conflict: Conflict = Conflict.REJECT) -> Transferred:
+    async def import_bundle(
+        request: Request, person: OperatorPerson, on_conflict: Conflict = Conflict.REJECT
+    ) -> Transferred:
         """Import a bundle (.rigcat.zip); the body is the file. It is checked as rig import checks it."""
 
         def store() -> Transferred:
-            with server.catalog.open_to_change() as catalog, read_bundle(path, catalog.clock) as source:
+            with server.catalog.open_to_change(person) as catalog, read_bundle(path, catalog.clock) as source:
                 return finished(transfer(source, catalog, conflict=on_conflict, descriptors=DESCRIPTORS, jobs=1))
 
         with TemporaryDirectory(prefix="rig-import-") as folder:

@@ -1,22 +1,32 @@
 """The REST API: saved runs, calibrations and the configuration."""
 
 import re
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from fastapi import Response
 from fastapi.responses import HTMLResponse, JSONResponse
+from pydantic import Field
 
 from rig.calibrations import CalibrationStore
-from rig.core.errors import JobNotFound
+from rig.bench.changes import set_key
+from rig.config.toml_file import NONE, Key, toml
+from rig.config.values import read_values
+from rig.config.wording import key_info
+from rig.core.errors import Forbidden, JobNotFound
 from rig.core.json_form import plain
 from rig.core.masking import masked
+from rig.core.next_steps import Do
 from rig.events.events import event_dict
 from rig.search.replay import ReplayCheck, check
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.answers import ListOf, RunName, SavedRunBody, time_text
+from rig.web.requests import SettingBody
 from rig.web.server import Page, Routes, Server, long_work
 from rig.web.work import calibrations
 
+CHANGED_BY_PAGES: Final = ("camera", "view", "enroll", "identify", "mark")
+"""Sections that a page may change. A wrong value of another one can harm the bench or reach other files."""
+NOT_BY_PAGES: Final = ("camera.source",)
 RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -72,6 +82,11 @@ def add_records(routes: Routes, server: Server) -> None:
                 "when_utc": time_text(one.when_utc),
                 "passed": one.passed,
                 "id": one.id,
+                "residual": one.residual,
+                "limit": one.limit,
+                "unit": one.residual_unit,
+                "valid_days": one.valid_days,
+                "rejections": [str(reason) for reason in one.rejections],
                 "values": {key: str(value) for key, value in one.estimates.items()},
             }
             for one in store.history()
@@ -84,3 +99,37 @@ def add_records(routes: Routes, server: Server) -> None:
         """Return the configuration in force, without passwords."""
         values: dict[str, Any] = masked(server.setup.config.model_dump(mode="json"))
         return values
+
+    @routes.watch.get("/settings", tags=["bench"])
+    def list_settings() -> dict[str, Any]:
+        """Return the keys of the configuration: value in force, value in the file, default, range, unit, meaning."""
+        config, file = server.setup.config, server.setup.config_file
+        written = read_values(file).values if file is not None and file.exists() else {}
+        keys = []
+        for info in key_info(type(config)):
+            if info.name == "bench":
+                continue  # options of other benches
+            value = {"value": _at(config.model_dump(mode="json"), info.key), "saved": _at(written, info.key)}
+            about = {"allowed": info.allowed, "unit": info.unit, "description": info.description}
+            default = plain({"value": info.default})["value"]
+            editable = file is not None and info.key[0] in CHANGED_BY_PAGES and info.name not in NOT_BY_PAGES
+            keys.append(masked({"key": info.name, **value, "default": default, **about}) | {"editable": editable})
+        return {"keys": keys, "file": None if file is None else str(file)}
+
+    @routes.operate.put("/settings/{key}", tags=["bench"])
+    def change_setting(key: Annotated[str, Field(max_length=60)], body: SettingBody) -> dict[str, Any]:
+        """Write a key into the configuration file; it is in force when the server starts again."""
+        file = server.setup.config_file
+        if file is None or key.partition(".")[0] not in CHANGED_BY_PAGES or key in NOT_BY_PAGES:
+            raise Forbidden(
+                f"A page cannot change {key}.",
+                next_step=("At a terminal of the bench's computer:", Do.SET_KEY(key=key, value="VALUE")),
+            )
+        return {"changed": set_key(file, key, NONE if body.value is None else toml(body.value))}
+
+
+def _at(values: Any, key: Key) -> Any:
+    """Return the value at a key of nested values; None if there is none."""
+    for part in key:
+        values = values.get(part) if isinstance(values, dict) else None
+    return values

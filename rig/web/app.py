@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 from starlette.exceptions import HTTPException
 
 from rig.core.errors import RigError
-from rig.web.api_bench import add_access, add_bench, add_jobs
+from rig.web.api_bench import add_access, add_bench, add_jobs, add_shelf
 from rig.web.api_catalog import add_bundles, add_objects, add_results
 from rig.web.api_pictures import add_pictures
 from rig.web.api_records import add_records
@@ -43,7 +43,17 @@ def create_app(server: Server) -> FastAPI:
     app.state.server = server
     # Three groups of routes by what a person may do: no login, watch, operate.
     routes = Routes()
-    for add in (add_access, add_bench, add_jobs, add_objects, add_results, add_bundles, add_pictures, add_records):
+    for add in (
+        add_access,
+        add_bench,
+        add_jobs,
+        add_shelf,
+        add_objects,
+        add_results,
+        add_bundles,
+        add_pictures,
+        add_records,
+    ):
         add(routes, server)
     for router in (routes.public, routes.watch, routes.operate):
         app.include_router(router, prefix=API, responses=_ERRORS)

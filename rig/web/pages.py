@@ -24,12 +24,14 @@ PAGES: Final = {
     "": "Bench",
     "enroll": "Enroll",
     "identify": "Identify",
-    "catalog": "Catalog",
-    "calibrations": "Calibrations",
-    "runs": "Runs",
+    "catalog": "Objects",
+    "runs": "History",
+    "calibrations": "Calibrate",
     "log": "Log",
     "settings": "Settings",
 }
+OTHER_PAGES: Final = {"object": ("Object", "catalog")}
+"""Pages that no menu names: their title, and the page of the menu to which they belong."""
 JOB_OF_STEP: Final[dict[Do, BaseModel]] = {
     Do.ACKNOWLEDGE: AcknowledgeRequest(),
     Do.ACKNOWLEDGE_IN_PROGRAM: AcknowledgeRequest(),
@@ -79,16 +81,18 @@ def pages(bench: str) -> APIRouter:
     shared = {"bench": bench, "actions": page_actions(), "dial": Markup(dial())}
     router = APIRouter(include_in_schema=False)
 
-    def page(name: str) -> None:
+    def page(name: str, title: str, current: str) -> None:
         template = templates.get_template(f"{name or 'bench'}.html.j2")
 
         @router.get(f"/{name}", response_class=HTMLResponse, name=f"page-{name or 'bench'}")
         def show() -> HTMLResponse:
-            content = template.render(pages=PAGES, current=name, title=PAGES[name], **shared)
+            content = template.render(pages=PAGES, current=current, title=title, **shared)
             return HTMLResponse(content, headers={"Cache-Control": "no-cache"})
 
-    for name in PAGES:
-        page(name)
+    for name, title in PAGES.items():
+        page(name, title, name)
+    for name, (title, current) in OTHER_PAGES.items():
+        page(name, title, current)
 
     @router.get("/login", response_class=HTMLResponse)
     def login() -> HTMLResponse:

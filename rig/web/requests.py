@@ -112,6 +112,16 @@ class DoctorRequest(_Request):
     kind: Literal["doctor"] = "doctor"
 
 
+class CameraRequest(_Request):
+    """Open the camera again with other locked settings; what is missing stays. They last until the server ends."""
+
+    kind: Literal["camera"] = "camera"
+    exposure_us: Annotated[float | None, Field(ge=1, le=1e6)] = None
+    gain: Annotated[float | None, Field(ge=0, le=1e6)] = None
+    white_balance_k: Annotated[float | None, Field(ge=1000, le=20_000)] = None
+    focus: Annotated[float | None, Field(ge=0, le=1e6)] = None
+
+
 class CalibrateRequest(_Request):
     """Run a calibration."""
 
@@ -130,6 +140,7 @@ JobRequest = Annotated[
     | ReferenceRequest
     | AcknowledgeRequest
     | DoctorRequest
+    | CameraRequest
     | CalibrateRequest,
     Field(discriminator="kind"),
 ]
@@ -234,6 +245,18 @@ class NameBody(_Request):
     """The name of an object."""
 
     name: Annotated[str, Field(max_length=1000)]
+
+
+class ByHand(_Request):
+    """What hands do at a simulated bench: ``put NAME``, ``clear``, ``light 0.5`` or ``unplug`` the camera."""
+
+    words: Annotated[list[Annotated[str, Field(max_length=100)]], Field(min_length=1, max_length=4)]
+
+
+class SettingBody(_Request):
+    """A new value of a key of the configuration; null clears a key that can be without one."""
+
+    value: bool | int | float | str | list[float] | None
 
 
 class CorrectionBody(_Request):

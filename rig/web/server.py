@@ -17,6 +17,7 @@ from starlette.requests import HTTPConnection
 from rig.catalog import Catalog
 from rig.catalog.copying import Attempts, open_or_copy
 from rig.catalog.journal import BackgroundDelivery, JournalState
+from rig.catalog.log import OPERATOR
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
@@ -50,8 +51,12 @@ class BenchCatalog:
         self._become(local_copy_utc=None if copied is None else f"{copied:%Y-%m-%d %H:%M:%S} UTC")
         return catalog
 
-    def open_to_change(self) -> Catalog:
-        """Open the catalog to change its objects; a `CatalogUnavailable` if its server does not answer."""
+    def open_to_change(self, person: Person) -> Catalog:
+        """Open the catalog to change its objects; a `CatalogUnavailable` if its server does not answer.
+
+        The log names the person, in the thread of this request.
+        """
+        OPERATOR.set(None if person.name == LOCAL else person.name)
         return Catalog.open(self._place, clock=self._clock)
 
     def background_delivery(self) -> BackgroundDelivery:

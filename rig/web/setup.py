@@ -35,14 +35,15 @@ class Listening(BaseModel):
 class Setup(BaseModel):
     """The bench that is served and how to open it, and the address of the server.
 
-    ``arguments`` are the arguments of `rig` that select the same bench. ``local_token`` lets commands of the same user
-    on this computer watch.
+    ``config_file`` is the file that the pages change, if they can. ``arguments`` are the arguments of `rig` that
+    select the same bench. ``local_token`` lets commands of the same user on this computer watch.
     """
 
     model_config = ConfigDict(frozen=True)
 
     bench: str
     config: RigConfig
+    config_file: Path | None = None
     seed: int | None = None
     arguments: tuple[str, ...] = ()
     listening: Listening

@@ -13,9 +13,10 @@ from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
 from rig.catalog.copying import open_or_copy
+from rig.catalog.log import OPERATOR
 from rig.charts.candidates import Styles, candidates_chart
 from rig.core.clock import SystemClock
-from rig.core.errors import UsageError
+from rig.core.errors import RigError, UsageError
 from rig.core.next_steps import NextSteps, as_steps, steps_as_json
 from rig.core.plugins import plugins
 from rig.doctor.context import open_context
@@ -34,6 +35,7 @@ from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
 from rig.views.description import within
 from rig.web import requests
+from rig.web.access import LOCAL
 from rig.web.picture import Outliner, jpeg
 from rig.web.requests import Job, JobState, TrayObject
 from rig.web.worker import BenchWorker
@@ -83,6 +85,18 @@ class ServedDesk(Desk):
     def close_bench(self) -> None:
         """Close the bench, for a job that opens its devices itself."""
         self._worker.close()
+
+    def reopen(self, camera: dict[str, Any]) -> None:
+        """Close the bench and open it with other settings of the camera."""
+        worker, before = self._worker, self.setup
+        config = before.config.model_copy(update={"camera": before.config.camera.model_copy(update=camera)})
+        worker.close()
+        worker.setup = before.model_copy(update={"config": config})
+        try:
+            worker.bench()
+        except RigError:
+            worker.setup = before
+            raise
 
     def who_places(self, bench: Bench) -> Operator:  # noqa: ARG002
         return self
@@ -195,6 +209,7 @@ class ServedDesk(Desk):
 def run_job(worker: BenchWorker, job: Job) -> None:
     """Run a job to its end; an operator who cancels closes it, and so the torque goes off."""
     desk, request = ServedDesk(worker, job), job.request
+    OPERATOR.set(None if job.operator == LOCAL else job.operator)
     parameters = {name: value for name, value in request if name != "kind"}
     with closing(JOBS[type(request)](desk, **parameters)) as steps:
         for step in steps:
@@ -231,6 +246,12 @@ def _examine(desk: ServedDesk) -> Steps[None]:
     return examine(setup.bench, opened)
 
 
+def _lock_camera(desk: ServedDesk, **settings: float | None) -> Steps[None]:
+    """Open the bench with other settings of its camera; if it does not take them, with those before."""
+    desk.reopen({key: value for key, value in settings.items() if value is not None})
+    yield JobResult(settings, "The camera is locked with these settings.")
+
+
 def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:
     """Run a calibration; its results are those of the job together."""
     found = calibrations()
@@ -259,5 +280,6 @@ JOBS: Final[dict[type[BaseModel], Callable[..., Steps[object]]]] = {
     requests.AcknowledgeRequest: acknowledge,
     requests.CalibrateRequest: _calibrate,
     requests.DoctorRequest: _examine,
+    requests.CameraRequest: _lock_camera,
 }
 """The job of each request; the fields of the request are its parameters."""

@@ -7,7 +7,7 @@ the running job and switch the torque off, as in every other command.
 import socket
 import threading
 from base64 import b64encode
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
@@ -28,7 +28,7 @@ from rig.safety.stop_channel import StopAnswer, StopListener, listen
 from rig.safety.supervisor import stopped
 from rig.web.jobs import JobQueue
 from rig.web.link import Link
-from rig.web.picture import LivePicture
+from rig.web.picture import LivePicture, jpeg
 from rig.web.problems import problem
 from rig.web.requests import Job, JobState
 from rig.web.setup import Setup
@@ -40,6 +40,7 @@ STATUS_S: Final = 0.25  # a page that shows the angle looks smooth enough; more 
 IDLE_STATUS_S: Final = 1.0  # at rest, the state changes by hand or supply only, and each reading occupies the bus
 REOPEN_S: Final = 5.0
 """Time after which a bench that could not be opened is opened again."""
+SHELF_PX: Final = 200  # a tile of the shelf; the objects are drawn on request
 JOBS_WITH_PICTURES: Final = 10  # older jobs keep their events, without pictures
 ASKED: Final = ("jobs", "job", "submit", "approve", "cancel", "pause", "resume", "answer")
 """Functions of the queue that the web process calls."""
@@ -80,6 +81,8 @@ class BenchWorker:
         self._link: Link | None = None
         self._picture = LivePicture(clock)
         self._bench: Bench | None = None
+        self._locks: dict[str, Any] = {}
+        """The camera's settings since the bench was opened."""
         self._error: RigError | None = None
         """Why the bench is not open."""
         self._tried_ns: int | None = None
@@ -87,6 +90,10 @@ class BenchWorker:
         self._job: Job | None = None
         self._ended = threading.Event()
         self._jobs_ended: Counter[str] = Counter()
+        self._hands: deque[list[str]] = deque()
+        """What a person at a page does by hand at a simulated bench, for the thread that owns the bench."""
+        self._put: list[str] = []
+        """What was put on the table last: another simulated bench, after the loss of a device, gets it again."""
         self._stops: StopListener = listen(setup.state_folder)
         self._stops_before = self._stops.count()
         """Number of stops before the present job: a further one stops it."""
@@ -112,6 +119,9 @@ class BenchWorker:
             "picture": self._newest,
             "numbers": lambda: {"jobs_ended": self._jobs_ended, "stops": self._stops.count()},
             "last_move": self._last_move,
+            "shelf": self._shelf_state,
+            "thing": self._thing,
+            "by_hand": self._by_hand,
             "alive": alive,
         }
         self._link = link = Link(connection, functions, ended)
@@ -147,6 +157,38 @@ class BenchWorker:
         if not moves:
             raise JobNotFound("The table has not moved yet.", next_step="Rotate it, then ask again.")
         return moves[-1]
+
+    # -- the shelf of a simulated bench -------------------------------------------------------------------------------
+
+    def _shelf_state(self) -> dict[str, Any]:
+        if self._bench is None or self._bench.shelf is None:
+            raise JobNotFound("This bench has no simulated shelf.", next_step="Put the objects on the table by hand.")
+        return {"things": list(self._bench.shelf.things), **self._bench.shelf.state()}
+
+    def _thing(self, thing: str) -> str:
+        self._shelf_state()
+        assert self._bench is not None
+        assert self._bench.shelf is not None
+        return b64encode(jpeg(self._bench.shelf.picture(thing), SHELF_PX)).decode()
+
+    def _by_hand(self, words: list[str]) -> dict[str, Any]:
+        """Do something by hand as soon as the bench's thread looks; errors go to the pages."""
+        state = self._shelf_state()
+        self._hands.append(words)
+        return state
+
+    def _use_hands(self) -> None:
+        bench = self._bench
+        while self._hands and bench is not None and bench.shelf is not None:
+            words = self._hands.popleft()
+            try:
+                bench.shelf.do(words)
+            except RigError as failure:
+                self.publish("shelf", {**bench.shelf.state(), "error": problem(failure)})
+                continue
+            if words[0] in ("put", "clear"):
+                self._put = words
+            self.publish("shelf", {**bench.shelf.state(), "error": None})
 
     # -- jobs ---------------------------------------------------------------------------------------------------------
 
@@ -245,6 +287,7 @@ class BenchWorker:
         if self._ended.is_set():
             raise JobCancelled
         self._clock.sleep(IDLE_S)
+        self._use_hands()
         self._show_picture()
 
     # -- the bench ----------------------------------------------------------------------------------------------------
@@ -259,9 +302,13 @@ class BenchWorker:
                 self._error = error
                 self._read_status()
                 raise
-            bench.camera.observers.append(self._picture.show)
+            if bench.shelf is not None:  # the person at the page takes the objects from the shelf
+                bench.placer = None
+                self._hands.extend([self._put] if self._put else [])
+            bench.camera.observers += [self._picture.show, lambda _: self._use_hands()]
             bench.safety.observers.append(self._observe)
             bench.safety.monitors.append(self._check_stop)
+            self._locks = plain(bench.camera.read_locks())
             self._bench, self._error = bench, None
             self._read_status()
         return self._bench
@@ -286,6 +333,7 @@ class BenchWorker:
                     self.bench()
             return
         self._bench.clock.sleep(IDLE_S)
+        self._use_hands()
         if seconds_between(self._status_ns, now_ns) >= IDLE_STATUS_S:
             self._read_status()
         self._show_picture()
@@ -307,6 +355,7 @@ class BenchWorker:
 
     def _observe(self, state: ServoState) -> None:
         """Take a reading of the servo from the control loop."""
+        self._use_hands()
         if seconds_between(self._status_ns, self._clock.now_ns()) >= STATUS_S:
             self._publish_status(state)
 
@@ -340,6 +389,7 @@ class BenchWorker:
                 "limits_deg": list(config.table.limits_deg),
                 "findings": list(bench.findings),
                 "camera": plain(bench.camera.identity),
+                "locks": self._locks,
                 "region": list(config.view.roi) if config.view.roi else None,
             }
         # An angle in doubt is not shown as one.

@@ -83,8 +83,8 @@ def launch() -> Iterator[Callable[..., Any]]:
 
 @pytest.fixture(scope="session")
 def chromium(launch: Callable[..., Any]) -> Iterator[Any]:
-    """A Chromium as the test driver starts it."""
-    browser = launch()
+    """A Chromium with its back/forward cache, which the test driver switches off by default."""
+    browser = launch(ignore_default_args=["--disable-back-forward-cache"])
     yield browser
     browser.close()
 

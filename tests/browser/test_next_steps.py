@@ -27,13 +27,15 @@ def test_fault_is_acknowledged_on_any_page(page, serve_process, stored, tmp_path
 
 
 def test_errors_name_no_command_that_a_page_can_do(page, serve_process):
-    server = serve_process("bench.sim.speed=20", 'enroll.mode="fly"')
+    server = serve_process("bench.sim.speed=20", 'enroll.mode="fly"', 'bench.sim.object="lamp"')
     page.goto(f"{server.url}enroll")
     page.fill("#name", "lamp")
-    page.click("#one button:has-text('Enroll')")
-    page.wait_for_selector("#job a[href='/calibrations']:has-text('Run the calibration camera-time')", timeout=WAIT_MS)
+    page.click("#go")
+    page.wait_for_selector(
+        "#said-detail a[href='/calibrations']:has-text('Run the calibration camera-time')", timeout=WAIT_MS
+    )
     page.goto(f"{server.url}identify")
-    page.click("#start button:has-text('Identify')")
+    page.click("#go")
     page.wait_for_selector("#answer-detail a[href='/enroll']:has-text('Enroll an object')", timeout=WAIT_MS)
     page.goto(server.url)
     page.click("#doctor")

@@ -36,7 +36,7 @@ def finish(server, job):
 
 
 def test_slow_and_silent_clients_do_not_disturb_a_job(serve_process):
-    server = serve_process("bench.sim.speed=1000")
+    server = serve_process("bench.sim.speed=1000", 'bench.sim.object="lamp"')
     get = b"GET /api/v1/events HTTP/1.1\r\nHost: 127.0.0.1\r\n"
     slow = [connect(server) for _ in range(20)]
     for one in slow:
@@ -62,7 +62,7 @@ def test_slow_and_silent_clients_do_not_disturb_a_job(serve_process):
 
 
 def test_commands_of_the_terminal_work_beside_the_server(serve_process):
-    server = serve_process("bench.sim.speed=1000")
+    server = serve_process("bench.sim.speed=1000", 'bench.sim.object="lamp"')
     finish(server, call(server, "jobs", {"kind": "enroll", "name": "lamp", "views": 4}))
     base = ["--bench", "sim", *server.settings]
 

@@ -8,7 +8,6 @@ import subprocess
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -25,14 +24,6 @@ PAGES = ("settings", "identify", "catalog", "calibrations", "runs", "log")
 WAIT_MS = 30_000
 SLOW = ("bench.sim.speed=1", "table.velocity_dps=20")
 """A rotation by 350° that takes 18 s: longer than any of these tests waits for a stop."""
-
-
-@pytest.fixture
-def browser(launch: Callable[..., Any]) -> Iterator[Any]:
-    """A Chromium with its back/forward cache, which the test driver switches off by default."""
-    browser = launch(ignore_default_args=["--disable-back-forward-cache"])
-    yield browser
-    browser.close()
 
 
 def call(server: Any, path: str, body: Any = None, method: str | None = None) -> Any:
@@ -98,9 +89,9 @@ def ended(pid: int) -> bool:
 # -- the browser -------------------------------------------------------------------------------------------------------
 
 
-def test_stop_on_the_sixth_page_with_the_back_forward_cache(browser, serve_process):
+def test_stop_on_the_sixth_page_with_the_back_forward_cache(chromium, serve_process):
     server = serve_process(*SLOW)
-    page = browser.new_context().new_page()
+    page = chromium.new_context().new_page()
     for name in PAGES:
         page.goto(f"{server.url}{name}")
         page.wait_for_selector("#state.good", timeout=WAIT_MS)
@@ -117,9 +108,9 @@ def test_stop_on_the_sixth_page_with_the_back_forward_cache(browser, serve_proce
     stopped(server, job)
 
 
-def test_stop_in_each_of_six_tabs_of_the_bench(browser, serve_process):
+def test_stop_in_each_of_six_tabs_of_the_bench(chromium, serve_process):
     server = serve_process(*SLOW)
-    context = browser.new_context()
+    context = chromium.new_context()
     tabs = [context.new_page() for _ in range(6)]
     for tab in tabs:
         tab.goto(server.url)
@@ -134,9 +125,9 @@ def test_stop_in_each_of_six_tabs_of_the_bench(browser, serve_process):
         stopped(server, job)
 
 
-def test_page_warns_after_a_second_if_the_bench_does_not_confirm(browser, serve_process):
+def test_page_warns_after_a_second_if_the_bench_does_not_confirm(chromium, serve_process):
     server = serve_process(*SLOW)
-    page = browser.new_context().new_page()
+    page = chromium.new_context().new_page()
     page.goto(server.url)
     page.wait_for_selector("#state.good", timeout=WAIT_MS)
     server.process.send_signal(signal.SIGSTOP)  # the process that owns the bench hangs
@@ -148,9 +139,9 @@ def test_page_warns_after_a_second_if_the_bench_does_not_confirm(browser, serve_
     page.wait_for_selector("#stop-state .confirmed", timeout=WAIT_MS)  # it has carried out the stop now
 
 
-def test_picture_without_successors_is_marked(browser, serve_process):
+def test_picture_without_successors_is_marked(chromium, serve_process):
     server = serve_process("bench.sim.speed=1")
-    page = browser.new_context().new_page()
+    page = chromium.new_context().new_page()
     page.goto(server.url)
     page.wait_for_selector("#live-image[src^='blob:']", timeout=WAIT_MS)
     page.wait_for_selector("#live-age", state="hidden", timeout=WAIT_MS)
@@ -180,7 +171,7 @@ def test_rig_stop_also_cancels_the_queue_of_the_server(serve_process):
 
 
 def test_stop_beside_exports(serve_process):
-    server = serve_process("bench.sim.speed=1000")
+    server = serve_process("bench.sim.speed=1000", 'bench.sim.object="lamp"')
     for name in ("lamp", "mug-star", "mug-white", "dice", "teapot", "toy-car"):
         job = call(server, "jobs", {"kind": "enroll", "name": name, "views": 36})["id"]
         assert wait_for(server, job, "done") == "done"
@@ -233,7 +224,7 @@ def test_stop_beside_silent_and_slow_connections(serve_process):
 
 
 def test_job_pauses_if_the_web_process_ends_and_resumes_with_the_next_one(serve_process):
-    server = serve_process("bench.sim.speed=3")
+    server = serve_process("bench.sim.speed=3", 'bench.sim.object="lamp"')
     job = call(server, "jobs", {"kind": "enroll", "name": "lamp", "views": 24})["id"]
     waiting = call(server, "jobs", {"kind": "home"})["id"]
     while call(server, f"jobs/{job}")["views"] < 2:

@@ -123,36 +123,19 @@ def set_(
 
     Example: rig config set servo.port /dev/ttyUSB1
     """
-    from rig.bench import check_config
     from rig.config import RigConfig
-    from rig.config.toml_file import changed_lines, read_text, save, with_values
-    from rig.config.values import FILE_NAME, default_path, parsed, read_values
+    from rig.bench.changes import set_key
+    from rig.config.values import FILE_NAME, default_path
     from rig.config.wording import key_info
 
     target = settings.config or default_path() or Path(FILE_NAME)
-    old = read_text(target) if target.exists() else ""
     if "." not in key and key not in {info.name for info in key_info(RigConfig)} - {"bench"}:
         raise UsageError(
             f"{key!r} has no section.",
             next_step=("Write SECTION.KEY. For example,", Do.SET_KEY(key="servo.id", value=2)),
         )
-    try:
-        overrides = [*settings.overrides, f"{key}={value}"]
-        check_config(read_values(target if target.exists() else None, overrides))
-    except ConfigError as error:
-        mistakes = [mistake.removeprefix("--set: ") for mistake in error.evidence.get("mistakes", ())]
-        raise ConfigError(
-            f"{target} is unchanged: it would have mistakes.",
-            next_step=("Give another value. For the keys and their values,", Do.SHOW_CONFIGURATION()),
-            evidence={"mistakes": mistakes} if mistakes else error.evidence,
-        ) from error
-    new = with_values(old, {tuple(key.split(".")): parsed(value)})
-    if new != old:
-        save(target, new)
-    changed = masked(changed_lines(old, new))
-    text = (
-        "\n".join([f"{target}:", *changed]) if new != old else f"{target}: no change, the key has this value already."
-    )
+    changed = set_key(target, key, value, settings.overrides)
+    text = "\n".join([f"{target}:", *changed]) if changed else f"{target}: no change, the key has this value already."
     settings.say(text, {"path": target, "key": key, "changed": changed})
 
 

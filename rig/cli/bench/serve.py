@@ -63,6 +63,7 @@ def serve(
             f"rig serve needs packages that are not installed ({error.name}).",
             next_step=Do.INSTALL_EXTRA(extra="web"),
         ) from error
+    from rig.config.values import FILE_NAME, default_path
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
     from rig.web.run import run_server
@@ -116,6 +117,7 @@ def serve(
     setup = Setup(
         bench=settings.bench_name,
         config=settings.load(),
+        config_file=(settings.config or default_path() or Path(FILE_NAME)).absolute(),
         seed=settings.seed,
         arguments=arguments,
         listening=listening,

@@ -1,5 +1,6 @@
 import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table } from "./rig.js";
 import { pathDrawing, picture, viewPicture } from "./pictures.js";
+import "./shelf.js";
 
 // -- one object: a name that is known already is a choice ------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 import { $, API, act, at, counted, either, followJob, get, h, isEnded, nextSteps, on, percent, remembered, showJob, start, when } from "./rig.js";
 import { pathDrawing, picture, posePicture, viewPicture } from "./pictures.js";
+import "./shelf.js";
 
 const SHOWN = 4; // candidates: more are unlikely, and push the steps out of sight
 const KEPT = 10;

@@ -1,55 +1,138 @@
-// Calibrations, runs, log and settings: each part runs on the page that has its element.
-import { $, API, act, counted, followJobs, h, on, pager, percent, request, start, submit, table, whoami } from "./rig.js";
+// Calibrations, log and settings: each part runs on the page that has its element.
+import { $, act, canOperate, counted, dayOf, followJob, get, h, number, on, pager, request, showJob, start, submit, table, timeOf, toast, when, whoami } from "./rig.js";
+
+// -- calibrations -----------------------------------------------------------------------------------------------------------
+
+/** Return how well a calibration fits, beside its limit. */
+function residual(one) {
+  if (one.residual === null || one.limit === null) return null;
+  const share = Math.min(one.residual / one.limit, 1);
+  return h("div", {}, h("progress", { max: 1, value: share, "aria-label": "residual, as a share of its limit" }), h("span", { class: "small soft" }, `residual ${Number(one.residual.toPrecision(2))} of at most ${Number(one.limit.toPrecision(2))} ${one.unit}`));
+}
+
+/** Return when a result ends, in words. */
+function validity(one) {
+  if (!one.passed || one.valid_days === null) return "";
+  const left = one.valid_days - (Date.now() - Date.parse(one.when_utc)) / 86400000;
+  return left < 0 ? "expired" : `valid for ${counted(Math.ceil(left), "more day")}`;
+}
 
 if ($("calibrations")) {
   const load = async () => {
-    const found = await request("GET", "/calibrations");
-    $("available").replaceChildren(...Object.entries(found.available).map(([name, title]) => h("button", { onclick: () => submit({ kind: "calibrate", name }) }, title)));
-    if (!Object.keys(found.available).length) $("available").replaceChildren(h("p", {}, "No calibrations are installed."));
-    table($("calibrations"), ["Calibration", "Date", "Outcome", "Values"], found.history.map((one) => [one.name, one.when_utc, one.passed ? "passed" : "not passed", Object.entries(one.values).map(([key, value]) => `${key} ${value}`).join("; ")]));
+    const { history, available } = await get("/calibrations");
+    const cards = Object.entries(available).map(([name, title]) => {
+      const newest = [...new Map(history.filter((one) => one.name.split(".")[0] === name.replaceAll("-", "_")).reverse().map((one) => [one.name, one])).values()];
+      const results = newest.map((one) => h("div", {},
+        h("p", {}, h("span", { class: `tag ${one.passed ? "good" : "bad"}` }, one.passed ? "passed" : "not passed"), ` ${when(one.when_utc)}`, validity(one) && h("span", { class: "soft small" }, `, ${validity(one)}`)),
+        residual(one),
+        h("dl", { class: "values small" }, ...Object.entries(one.values).slice(0, 4).flatMap(([key, value]) => [h("dt", {}, key.replaceAll("_", " ")), h("dd", {}, value)])),
+        ...one.rejections.map((words) => h("p", { class: "error small" }, words))));
+      return h("li", { class: "card" }, h("h2", {}, title), ...(results.length ? results : [h("p", { class: "soft" }, "Never done on this bench.")]), h("button", { class: results.length ? "quiet" : "", onclick: () => submit({ kind: "calibrate", name }) }, results.length ? "Run again" : "Run"));
+    });
+    $("calibrations").replaceChildren(...(cards.length ? cards : [h("li", { class: "empty" }, "No calibrations are installed.")]));
+    table($("history"), ["Calibration", "Date", "Outcome", "Values"], history.map((one) => [one.name, when(one.when_utc), one.passed ? "passed" : "not passed", Object.entries(one.values).map(([key, value]) => `${key} ${value}`).join("; ")]));
   };
   on("hello", () => act(load));
-  followJobs(["calibrate"], (job) => { if (job.state === "done") act(load); });
+  followJob(["calibrate"], { begin() {}, event() {}, render(job) { showJob($("job"), job); if (job.state === "done") act(load); } });
 }
 
-if ($("runs")) {
-  const open = async (name) => {
-    const run = await request("GET", `/runs/${name}`);
-    $("checked").textContent = "";
-    $("run-actions").replaceChildren(
-      h("a", { class: "button", href: `${API}/runs/${name}/report`, target: "_blank" }, "Open the report"),
-      h("button", { onclick: () => act(async () => {
-        $("checked").textContent = "Computing again …";
-        const done = await request("POST", `/runs/${name}/check`);
-        $("checked").textContent = done.differences.length ? `${counted(done.differences.length, "difference")}: ${done.differences.slice(0, 3).join("; ")}` : `Computed again: ${counted(done.views, "descriptor")} and ${counted(done.decisions, "decision")}. All are as saved.`;
-      }) }, "Compute again"));
-    $("replay").replaceChildren(...run.events.filter((event) => event.text).map((event) => h("li", {}, event.text)));
-  };
-  const answers = async () => {
-    const page = await request("GET", "/results?limit=50");
-    table($("answers"), ["Time (UTC)", "Sample", "Answer", "Confidence", "Views", "Operator"], page.items.map((one) => [one.time_utc.slice(0, 19).replace("T", " "), one.sample, one.outcome === "unknown" ? "unknown object" : `${one.outcome === "ambiguous" ? "ambiguous: " : ""}${one.object}${one.corrections ? " (corrected)" : ""}`, one.confidence === null ? "" : percent(one.confidence), one.views, one.operator]));
-  };
-  on("hello", () => act(answers));
-  const runs = pager(() => "/runs?limit=50", ({ items }, isFirst) => {
-    if (isFirst) $("runs").replaceChildren();
-    $("runs").append(...items.map((run) => h("li", {}, h("button", { class: "quiet", onclick: () => act(() => open(run.name)) }, run.name))));
-    if (!$("runs").children.length) $("runs").append(h("li", {}, "There are no runs yet. Identify an object."));
-  });
-  on("hello", () => act(runs));
-}
+// -- the log ------------------------------------------------------------------------------------------------------------------
+
+const OUTCOMES = { found: (name) => `identified ${name}`, unknown: () => "identified an unknown object", ambiguous: (name) => `could not tell ${name} from another object`, empty: () => "found the table empty" };
+const SENTENCES = {
+  "enrollment started": ({ object_name: name, details }) => `began to enroll ${name}${details.replace ? " again" : ""}, ${counted(details.views, "view")}`,
+  "enrollment resumed": ({ object_name: name }) => `continued the enrollment of ${name}`,
+  "enrollment abandoned": ({ object_name: name }) => `gave up an enrollment of ${name}`,
+  "enrollment discarded": ({ object_name: name }) => `discarded an enrollment of ${name}`,
+  "enrollment superseded": ({ object_name: name }) => `replaced the earlier enrollment of ${name}`,
+  enrolled: ({ object_name: name, details }) => `enrolled ${name} with ${counted(details.views, "view")}`,
+  identified: ({ object_name: name, details }) => (OUTCOMES[details.outcome] || (() => "identified an object"))(name) + (details.sample ? `, sample ${details.sample}` : ""),
+  "result corrected": ({ object_name: name, details }) => `corrected answer ${details.result}${name ? ` to ${name}` : ""}${details.reason ? `: ${details.reason}` : ""}`,
+  renamed: ({ object_name: name, details }) => `renamed ${details.old_name || details.before || "an object"} to ${name}`,
+  labelled: ({ object_name: name }) => `changed the label or note of ${name}`,
+  deleted: ({ object_name: name }) => `deleted ${name}`,
+  undeleted: ({ object_name: name }) => `restored ${name}`,
+  imported: ({ object_name: name }) => `imported ${name || "objects"}`,
+  "collected garbage": () => "removed deleted objects from the disk",
+  delivered: () => "delivered objects to the shared catalog",
+  moved: ({ details }) => `rotated the table to ${number(details.to_deg, 1)}°${details.ended ? `, which ended early: ${details.ended}` : ""}`,
+  "photographed the empty table": () => "took the empty-table image",
+};
 
 if ($("log")) {
-  let rows = [];
+  let lastDay = "";
   const log = pager(() => "/log?limit=100", ({ items }, isFirst) => {
-    rows = isFirst ? items : [...rows, ...items];
-    table($("log"), ["Time (UTC)", "Action", "Object", "User", "Details"], rows.map((one) => [one.time_utc, one.action, one.object_name, `${one.user} on ${one.host}`, JSON.stringify(one.details)]));
+    if (isFirst) [lastDay] = ["", $("log").replaceChildren()];
+    for (const entry of items) {
+      const day = dayOf(entry.time_utc);
+      if (day !== lastDay) $("log").append(h("li", { style: "display: block" }, h("h2", {}, day)));
+      lastDay = day;
+      const who = entry.details.operator && entry.details.operator !== "local" ? entry.details.operator : entry.user;
+      $("log").append(h("li", {}, h("time", { datetime: entry.time_utc }, timeOf(entry.time_utc)), h("div", {}, h("strong", {}, who), ` ${(SENTENCES[entry.action] || (() => `${entry.action} ${entry.object_name || ""}`))(entry)}.`)));
+    }
+    if (!$("log").children.length) $("log").append(h("li", { class: "empty" }, "Nothing has happened yet."));
   });
   on("hello", () => act(log));
 }
 
-if ($("configuration")) {
-  const flat = (values, prefix = "") => Object.entries(values).flatMap(([key, value]) => (value !== null && typeof value === "object" && !Array.isArray(value) ? flat(value, `${prefix}${key}.`) : [[prefix + key, value === null ? "none" : JSON.stringify(value)]]));
-  on("hello", () => act(async () => table($("configuration"), ["Key", "Value"], flat(await request("GET", "/configuration")))));
+// -- settings -----------------------------------------------------------------------------------------------------------------
+
+const TITLES = { servo: "Servo", table: "Table", mark: "Home mark", safety: "Safety", imu: "Gyro", head: "Rig head", camera: "Camera", camera_time: "Time of the camera", view: "Quality of views", catalog: "Catalog", enroll: "Enroll", identify: "Identify" };
+const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
+const shown = (value) => (value === null ? "none" : Array.isArray(value) ? value.join(", ") : String(value));
+
+/** Return what was typed as a value of the same kind as those before. */
+function typed(field, key) {
+  const text = field.value.trim();
+  if (text === "" || text === "none") return null;
+  if (typeof key.default === "boolean") return text === "true";
+  const numbers = text.split(",").map(Number);
+  if (Array.isArray(key.default) && numbers.every((one) => !Number.isNaN(one))) return numbers;
+  return key.allowed.includes("number") && !Number.isNaN(Number(text)) ? Number(text) : text;
+}
+
+if ($("settings")) {
+  let keys = [];
+  const save = (key, value) => act(async () => {
+    const before = key.saved ?? key.value;
+    await request("PUT", `/settings/${key.key}`, { value });
+    await load();
+    toast(`${key.key} is ${shown(value)}.`, async () => { await request("PUT", `/settings/${key.key}`, { value: before }); await load(); });
+  });
+  const row = (key) => {
+    const now = key.saved ?? key.value;
+    const id = `set-${key.key}`;
+    const field = typeof key.default === "boolean"
+      ? h("select", { id }, ...["true", "false"].map((one) => h("option", { value: one, selected: String(now) === one }, one === "true" ? "yes" : "no")))
+      : h("input", { id, value: shown(now) });
+    field.disabled = !key.editable || !canOperate();
+    field.addEventListener("change", () => save(key, typed(field, key)));
+    const waits = key.saved !== null && !same(key.saved, key.value);
+    return h("div", { class: `setting${same(now, key.default) ? "" : " changed"}` },
+      h("div", {}, h("label", { for: id }, h("strong", {}, key.key.split(".").at(-1).replaceAll("_", " "))), h("p", { class: "small" }, key.description), h("p", { class: "small soft" }, `${key.allowed}${key.unit ? `, in ${key.unit}` : ""}; default ${shown(key.default)}${key.editable ? "" : "; changed at the bench's computer"}`), waits && h("p", { class: "small error" }, `In force now: ${shown(key.value)}. The new value counts after the server starts again.`)),
+      h("div", { class: "row" }, field, key.editable && !same(now, key.default) && h("button", { class: "link", "aria-label": `Reset ${key.key}`, onclick: () => save(key, key.default) }, "Reset")));
+  };
+  const render = () => {
+    const text = $("search").value.trim().toLowerCase();
+    const found = keys.filter((key) => `${key.key} ${key.key.replaceAll("_", " ")} ${key.description}`.toLowerCase().includes(text) && (!$("changed").checked || !same(key.saved ?? key.value, key.default)));
+    $("count").textContent = counted(found.length, "setting");
+    const sections = [...new Set(found.map((key) => key.key.split(".").at(-2) || ""))];
+    const part = (section) => found.filter((key) => (key.key.split(".").at(-2) || "") === section);
+    const group = (section) => h("details", { class: "group", open: Boolean(text) || $("changed").checked || part(section)[0].editable }, h("summary", {}, TITLES[section] || "General"), ...part(section).map(row));
+    const [here, there] = [sections.filter((section) => part(section).some((key) => key.editable)), sections.filter((section) => !part(section).some((key) => key.editable))];
+    $("settings").replaceChildren(...here.reverse().map(group), ...(there.length ? [h("h2", { class: "wide" }, "Set at the bench's computer")] : []), ...there.map(group));
+    const waiting = keys.filter((key) => key.saved !== null && !same(key.saved, key.value));
+    $("restart").replaceChildren(...(waiting.length ? [h("span", {}, `Start the server again, so that ${waiting.map((key) => key.key).join(", ")} count.`)] : []));
+  };
+  const load = async () => {
+    keys = (await get("/settings")).keys;
+    const open = [...$("settings").querySelectorAll("details[open] > summary")].map((one) => one.textContent);
+    render();
+    for (const one of $("settings").querySelectorAll("details")) if (open.includes(one.firstChild.textContent)) one.open = true;
+  };
+  $("search").addEventListener("input", render);
+  $("changed").addEventListener("change", render);
+  on("hello", () => act(load));
   on("me", () => { $("you").textContent = `User ${whoami().name}. You may ${whoami().role === "operate" ? "operate the bench" : "only watch"}.`; $("logout").hidden = whoami().name === "local"; });
   $("logout").addEventListener("click", () => act(async () => { await request("POST", "/logout"); location.assign("/login"); }));
 }

@@ -1,0 +1,113 @@
+import { $, API, act, ask, at, canOperate, counted, dayOf, get, h, on, request, start, toast, when } from "./rig.js";
+import { lineChart, picture, viewPicture } from "./pictures.js";
+
+let one = null;
+const wanted = () => new URLSearchParams(location.search).get("name") || "";
+
+function values(box, rows) {
+  box.replaceChildren(...rows.filter(([, value]) => value).flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+}
+
+// -- the views -------------------------------------------------------------------------------------------------------------
+
+let silhouettes = {};
+
+async function showView(view) {
+  const e = view.evidence;
+  values($("view"), [
+    ["View", `${view.index + 1} of ${one.views_taken.length}`],
+    ["Taken", view.captured_utc && when(view.captured_utc)],
+    ["Sharpness", e.sharpness?.toFixed(0)],
+    ["Brightness", e.mean_level === undefined ? null : `${e.mean_level.toFixed(0)} of 255`],
+    ["Too bright", e.saturated_share === undefined ? null : `${(100 * e.saturated_share).toFixed(1)} %`],
+    ["Exposure", e.locks?.exposure_us && `${(e.locks.exposure_us / 1000).toFixed(1)} ms`],
+  ]);
+  if (!$("outline-on").checked) return;
+  const place = one.views_taken.indexOf(view);
+  silhouettes[place] ||= get(`/silhouette?object=${at(one.name)}&index=${place}`).catch(() => null);
+  const found = await silhouettes[place];
+  if (found && $("turn").views[$("turn").place] === view) $("turn").silhouette(found);
+}
+$("turn").addEventListener("turn", (event) => showView(event.detail));
+$("outline-on").addEventListener("change", () => $("turn").turn($("turn").place));
+
+// -- the object -------------------------------------------------------------------------------------------------------------
+
+const ENROLLMENT = { complete: ["in use", "good"], superseded: ["replaced", ""], abandoned: ["given up", ""], "in progress": ["not complete", "amber"] };
+
+async function load() {
+  one = await get(`/objects/${at(wanted())}`);
+  $("object-name").textContent = one.name;
+  document.title = `${one.name} – ${document.title.split(" – ").at(-1)}`;
+  $("object-label").textContent = one.label;
+  silhouettes = {};
+  values($("about"), [
+    ["Views", one.unfinished_views === null ? String(one.views) : `${one.unfinished_views}, interrupted`],
+    ["Label", one.label],
+    ["Note", one.note],
+    ["First enrolled", dayOf(one.created_utc)],
+    ["Looks the same", one.similar?.period_deg === 0 ? "from all sides" : one.similar?.period_deg && one.similar.period_deg < 360 ? `every ${one.similar.period_deg}°` : null],
+  ]);
+  $("again").href = `/enroll?name=${at(one.name)}`;
+  $("again").textContent = one.unfinished_views === null ? "Enroll again" : "Continue the enrollment";
+  $("object-export").href = `${API}/export?name=${at(one.name)}`;
+  for (const id of ["rename", "label", "delete"]) $(id).disabled = !canOperate();
+  $("enrollments").replaceChildren(...one.enrollments.map((e) => {
+    const [words, kind] = ENROLLMENT[e.status] || [e.status, ""];
+    const bench = e.sessions[0] ? `, bench ${e.sessions[0].bench}` : "";
+    return h("li", {}, h("span", { class: `tag ${kind}` }, words), ` ${when(e.started_utc)}: ${e.stored_views} of ${counted(e.planned_views, "view")}${bench}`);
+  }));
+  $("turn").hidden = !one.views_taken.length;
+  if (one.views_taken.length) $("turn").show(one.name, one.views_taken);
+  const measured = one.views_taken.filter((view) => view.evidence.sharpness !== undefined);
+  const line = (name, key, colour) => ({ name, colour, points: measured.map((view) => [view.azimuth_deg, view.evidence[key]]).sort((a, b) => a[0] - b[0]) });
+  $("meters").replaceChildren(...(measured.length > 1 ? [h("h3", { class: "wide" }, "Sharpness and brightness around the object"), lineChart([line("sharpness", "sharpness", "c0"), line("brightness", "mean_level", "c1")], { label: "Sharpness and brightness of the views by angle", zero: true, high: 190 })] : []));
+  act(showSimilar);
+}
+
+async function showSimilar() {
+  const parts = [];
+  for (const other of one.similar?.objects || []) {
+    const found = await get(`/pairs?object=${at(one.name)}&other=${at(other.name)}`).catch(() => null);
+    if (!found) continue;
+    const pair = (p, words) => h("div", {}, h("h3", {}, words), h("div", { class: "pair" }, picture(viewPicture(p.view), `${one.name} at ${p.azimuth_deg.toFixed(0)}°`, one.name), picture(viewPicture(p.other_view), `${other.name} at ${p.other_azimuth_deg.toFixed(0)}°`, h("a", { href: `/object?name=${at(other.name)}` }, other.name))));
+    parts.push(h("div", { class: "columns" }, pair(found.alike, `${other.name}: most alike`), pair(found.different, "Most different")));
+  }
+  $("similar").replaceChildren(...parts);
+  $("similar-section").hidden = !parts.length;
+}
+
+// -- changes -----------------------------------------------------------------------------------------------------------------
+
+const change = (name, body) => request("PATCH", `/objects/${at(name)}`, body);
+
+$("rename").addEventListener("click", async () => {
+  const field = h("input", { value: one.name, "aria-label": "New name", maxlength: 100 });
+  if ((await ask(`Rename ${one.name}`, field, [["save", "Rename"]])) !== "save" || field.value === one.name) return;
+  await act(async () => {
+    const before = one.name;
+    const to = (name) => { history.replaceState(null, "", `/object?name=${at(name)}`); return load(); };
+    const { name } = await change(before, { name: field.value });
+    await to(name);
+    toast(`${before} is now ${name}.`, async () => { await change(name, { name: before }); await to(before); });
+  });
+});
+$("label").addEventListener("click", async () => {
+  const [label, note] = [h("input", { value: one.label, id: "new-label", maxlength: 1000 }), h("textarea", { id: "new-note", rows: 4, maxlength: 10000 }, one.note)];
+  const fields = h("div", { class: "fields" }, h("label", { for: "new-label" }, "Label"), label, h("label", { for: "new-note" }, "Note"), note);
+  if ((await ask(`Label and note of ${one.name}`, fields, [["save", "Save"]])) !== "save") return;
+  await act(async () => {
+    const before = { label: one.label, note: one.note };
+    await change(one.name, { label: label.value, note: note.value });
+    await load();
+    toast("Saved.", async () => { await change(one.name, before); await load(); });
+  });
+});
+$("delete").addEventListener("click", () => act(async () => {
+  await request("DELETE", `/objects/${at(one.name)}`);
+  $("main").inert = true;
+  toast(`${one.name} is deleted. Searches do not find it any more.`, async () => { await request("POST", "/undelete", { name: one.name }); $("main").inert = false; await load(); });
+}));
+
+on("hello", () => act(load));
+start();
