@@ -179,8 +179,9 @@ class ShelfOperator:
 class SimShelf:
     """The shelf of a simulated bench: a person at a page puts its objects on the table, and changes the bench."""
 
-    def __init__(self, operator: ShelfOperator) -> None:
+    def __init__(self, operator: ShelfOperator, unplug: Callable[[], None]) -> None:
         self._operator = operator
+        self._unplug = unplug
 
     @property
     def things(self) -> list[str]:
@@ -216,10 +217,8 @@ class SimShelf:
                 operator.world.put(None)
             case ["light", ("0.25" | "0.5" | "1" | "1.5") as factor]:
                 operator.world.change(light=(float(factor),) * 3)
-            case ["unplug"] if operator.faults is not None:
-                operator.faults.schedule(
-                    Fault.parse(f"camera.off@{operator.world.clock.now_ns() * 1e-9}s+{_UNPLUGGED_S}s")
-                )
+            case ["unplug"]:
+                self._unplug()
             case _:
                 raise UsageError("Hands cannot do that.", next_step="put NAME, clear, light 0.5, or unplug.")
 
@@ -319,6 +318,8 @@ class SimBenchKind(BenchKind):
 
     name = "sim"
     options: type[BaseModel] = SimOptions
+    _camera_back_ns = 0
+    """When the camera is plugged in again, on the computer's clock; a bench that is opened before has none."""
 
     def prepare(self, config: RigConfig, options: SimOptions) -> Stage:  # noqa: ARG002
         """Return what is on the bench."""
@@ -340,9 +341,22 @@ class SimBenchKind(BenchKind):
                 stage.config, operator, faults=map(Fault.parse, options.faults), open_now=(), name=self.name
             )
             bench.findings += stage.findings
-            bench.shelf = SimShelf(operator) if options.object is None else None
+            self._keep_unplugged(operator, options)
+            if options.object is None:
+                bench.shelf = SimShelf(operator, partial(self._unplug, operator, options))
             bench.connections.enter_context(held.pop_all())
         return bench
+
+    def _unplug(self, operator: ShelfOperator, options: SimOptions) -> None:
+        self._camera_back_ns = SystemClock().now_ns() + round(_UNPLUGGED_S * 1e9)
+        self._keep_unplugged(operator, options)
+
+    def _keep_unplugged(self, operator: ShelfOperator, options: SimOptions) -> None:
+        """Unplug the camera of a bench until it is plugged in again."""
+        left_s = (self._camera_back_ns - SystemClock().now_ns()) * 1e-9 * (options.speed or 1.0)
+        if left_s > 0 and operator.faults is not None:
+            now_s = operator.world.clock.now_ns() * 1e-9
+            operator.faults.schedule(Fault.parse(f"camera.off@{now_s:.6f}s+{left_s:.6f}s"))
 
     @contextmanager
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:

@@ -146,7 +146,7 @@ function valuesOf(form) {
     if (field.dataset.kind === "truth") return field.value === "true";
     return field.type === "number" ? Number(field.value) : field.value;
   };
-  const given = [...form.elements].filter((field) => field.name && !field.disabled && (field.type !== "radio" || field.checked));
+  const given = [...form.elements].filter((field) => field.name && !field.disabled && (field.checked || (field.type !== "radio" && !("onlyTicked" in field.dataset))));
   return Object.fromEntries(given.map((field) => [field.name, value(field)]));
 }
 
