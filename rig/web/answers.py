@@ -169,6 +169,13 @@ class RunName(BaseModel):
     name: str
 
 
+class JobEvents(BaseModel):
+    """The events of a job so far, as the messages ``plan`` of the stream, and the id after which a stream continues."""
+
+    items: list[dict[str, Any]]
+    last: str
+
+
 class SavedRunBody(BaseModel):
     """The events of a saved run. Each also has ``text``: the event in words, empty if it has none."""
 

@@ -15,6 +15,7 @@ from rig.web.access import Role
 from rig.web.answers import (
     EventStream,
     Health,
+    JobEvents,
     JobMessage,
     Jpeg,
     LeaseState,
@@ -215,7 +216,7 @@ def add_jobs(routes: Routes, server: Server) -> None:
         """Return the chart of the candidates of a recent search as SVG, after its last view."""
         return Svg(server.remote.call("candidates", job_id=job_id), headers={"Cache-Control": "no-store"})
 
-    @routes.watch.get("/jobs/{job_id}/events", tags=["jobs"])
+    @routes.watch.get("/jobs/{job_id}/events", tags=["jobs"], responses={200: {"model": JobEvents}})
     def get_job_events(job_id: str) -> Response:
         """Return the events of a recent job so far, and the id after which a stream continues."""
         server.remote.call("job", job_id=job_id)

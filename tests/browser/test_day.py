@@ -81,7 +81,7 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     page.click("#answers button:has-text('Details')")
     page.click("dialog button:has-text('Correct it')")
     page.select_option("#right-object", "mug-white")
-    page.fill("#right-reason", "the label says so")
+    page.fill("#right-reason", "the label was read")
     page.click("dialog button:has-text('Save')")
     page.wait_for_selector("#answers td:has-text('corrected, was mug-star')")
     fits()
@@ -90,13 +90,13 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     page.fill("#search", "star")
     page.wait_for_selector("#count:has-text('1 object')")
     page.click(".cards a")
-    page.wait_for_selector("#turn .number")
-    first = page.text_content("#turn .number")
-    page.focus("#turn input")
+    page.wait_for_selector("#viewer .number")
+    first = page.text_content("#viewer .number")
+    page.focus("#viewer input")
     page.keyboard.press("ArrowRight")
-    assert page.text_content("#turn .number") != first
+    assert page.text_content("#viewer .number") != first
     page.click("#outline-on")
-    page.wait_for_selector("#turn polygon", state="attached")
+    page.wait_for_selector("#viewer polygon", state="attached")
     fits()
     page.click("#rename")
     page.fill("dialog input", "mug-red-star")
@@ -141,7 +141,7 @@ def test_first_contact_leads_from_an_empty_table_to_an_answer(page, serve_proces
     server = serve_process("bench.sim.speed=50", "enroll.views=12")
     page.goto(server.url)
     page.click("#tour .now button:has-text('Take the image')")
-    for name in ("lamp", "teapot"):  # nothing is on the table that nobody put there
+    for name in ("lamp", "teapot"):  # only what a person put there is on the table
         page.goto(f"{server.url}enroll")
         page.wait_for_selector(
             "rig-shelf :text('The table is empty')" if name == "lamp" else ".shelf [aria-pressed=true]"

@@ -43,7 +43,7 @@ function aim(degrees) {
 }
 const nearest = (degrees) => degrees + 360 * Math.round(((tableDeg ?? 0) - degrees) / 360); // no revolution for nothing
 
-async function turn(degrees) {
+async function rotateTo(degrees) {
   aim(null);
   await submit({ kind: "goto", angle_deg: Number(degrees.toFixed(2)) });
 }
@@ -56,19 +56,19 @@ $("dial").addEventListener("pointerdown", (event) => {
   $("dial").setPointerCapture(event.pointerId);
   aim(place(event));
   $("dial").onpointermove = (move) => aim(place(move));
-  $("dial").onpointerup = () => { $("dial").onpointermove = null; $("dial").onpointerup = null; if (wanted !== null) turn(wanted); };
+  $("dial").onpointerup = () => { $("dial").onpointermove = null; $("dial").onpointerup = null; if (wanted !== null) rotateTo(wanted); };
   $("dial").onpointercancel = () => { $("dial").onpointermove = null; aim(null); };
 });
 $("dial").addEventListener("keydown", (event) => {
   const step = { ArrowLeft: 5, ArrowUp: 5, ArrowRight: -5, ArrowDown: -5, PageUp: 45, PageDown: -45 }[event.key];
   if (step) aim((wanted ?? Math.round((tableDeg ?? 0) / 5) * 5) + step);
-  else if (event.key === "Enter" && wanted !== null) turn(wanted);
+  else if (event.key === "Enter" && wanted !== null) rotateTo(wanted);
   else if (event.key === "Escape") aim(null);
   else return;
   event.preventDefault();
 });
 
-$("jog").replaceChildren(...[90, 15, 5, 1, -1, -5, -15, -90].map((step) => h("button", { type: "button", class: "quiet", "aria-label": `Rotate by ${number(step)}°`, onclick: () => { if (tableDeg !== null) turn(tableDeg + step); } }, `${step > 0 ? "+" : ""}${number(step)}`)));
+$("jog").replaceChildren(...[90, 15, 5, 1, -1, -5, -15, -90].map((step) => h("button", { type: "button", class: "quiet", "aria-label": `Rotate by ${number(step)}°`, onclick: () => { if (tableDeg !== null) rotateTo(tableDeg + step); } }, `${step > 0 ? "+" : ""}${number(step)}`)));
 $("here").addEventListener("click", () => submit({ kind: "reference", here: true }));
 
 on("status", (status) => {
@@ -107,7 +107,7 @@ const ORDER = ["bad", "warning", "fine"];
 
 function findings(list, utc) {
   const counts = ORDER.map((level) => list.filter((one) => one.level === level).length);
-  $("check-words").textContent = `${counts[0] ? `${counts[0]} to mend, ` : "Nothing to mend, "}${counts[1]} to look at, ${counts[2]} fine (${when(utc)}).`;
+  $("check-words").textContent = `${counts[0] ? `${counts[0]} to repair, ` : "Nothing to repair, "}${counts[1]} to look at, ${counts[2]} fine (${when(utc)}).`;
   const row = (one) => h("li", { class: one.level }, h("span", { class: "mark", "aria-label": one.level }, MARKS[one.level]), h("div", {}, h("strong", {}, one.topic), ` ${one.finding}`, one.steps.length > 0 && h("p", {}, ...nextSteps(one.steps))));
   const [open, fine] = [list.filter((one) => one.level !== "fine"), list.filter((one) => one.level === "fine")];
   open.sort((a, b) => ORDER.indexOf(a.level) - ORDER.indexOf(b.level));

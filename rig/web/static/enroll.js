@@ -8,7 +8,7 @@ let known = null;
 let asking = null;
 
 /** Say that the name exists, and offer what can be done: continue, replace, another name. */
-async function look() {
+async function checkName() {
   const name = $("name").value.trim();
   known = name ? await get(`/objects/${at(name)}`).catch(() => null) : null;
   const unfinished = known !== null && known.unfinished_views !== null;
@@ -19,11 +19,11 @@ async function look() {
   if (unfinished) $("exists").replaceChildren(h("p", {}, `Its enrollment was interrupted. ${counted(known.unfinished_views, "view")} of it are stored; the others will be taken. `, h("button", { type: "button", class: "link", onclick: () => { $("resume").value = "false"; $("replace").value = "true"; $("go").textContent = "Start again"; } }, "Start again instead")));
   else if (known) $("exists").replaceChildren(h("p", {}, `${name} is enrolled with ${counted(known.views, "view")}. Its new views replace them when they are complete.`));
 }
-$("name").addEventListener("input", () => { clearTimeout(asking); asking = setTimeout(look, 250); });
+$("name").addEventListener("input", () => { clearTimeout(asking); asking = setTimeout(checkName, 250); });
 const wanted = new URLSearchParams(location.search).get("name");
 if (wanted) {
   $("name").value = wanted;
-  look();
+  checkName();
 }
 
 // -- the tray: a list that can be edited before the start -----------------------------------------------------------------

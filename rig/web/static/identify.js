@@ -145,8 +145,8 @@ function showAnswer(answer) {
     headline(error.code === EMPTY_TABLE ? "No object on the table" : "No answer", "unknown", error.code === EMPTY_TABLE ? "The table is empty. " : `${error.what} `, ...nextSteps(error.steps));
   } else if (outcome === "found") {
     const sure = answer.confidence === null || answer.confidence === undefined ? "" : `${percent(answer.confidence)} sure`;
-    const turned = answer.yaw_deg === null || answer.yaw_deg === undefined ? "" : `, turned by ${answer.yaw_deg.toFixed(0)}°`;
-    headline(answer.name, "found", [sure, time].filter(Boolean).join(", ") + turned);
+    const rotated = answer.yaw_deg === null || answer.yaw_deg === undefined ? "" : `, turned by ${answer.yaw_deg.toFixed(0)}°`;
+    headline(answer.name, "found", [sure, time].filter(Boolean).join(", ") + rotated);
     pictures = [[candidates[0], `as enrolled, from the same side`]];
   } else if (outcome === "ambiguous") {
     headline(either(answer.possible.slice(0, 3)), "ambiguous", `The views do not tell them apart (${time}).`);

@@ -26,10 +26,10 @@ async function showView(view) {
   const place = one.views_taken.indexOf(view);
   silhouettes[place] ||= get(`/silhouette?object=${at(one.name)}&index=${place}`).catch(() => null);
   const found = await silhouettes[place];
-  if (found && $("turn").views[$("turn").place] === view) $("turn").silhouette(found);
+  if (found && $("viewer").views[$("viewer").place] === view) $("viewer").silhouette(found);
 }
-$("turn").addEventListener("turn", (event) => showView(event.detail));
-$("outline-on").addEventListener("change", () => $("turn").turn($("turn").place));
+$("viewer").addEventListener("view", (event) => showView(event.detail));
+$("outline-on").addEventListener("change", () => $("viewer").showPlace($("viewer").place));
 
 // -- the object -------------------------------------------------------------------------------------------------------------
 
@@ -57,8 +57,8 @@ async function load() {
     const bench = e.sessions[0] ? `, bench ${e.sessions[0].bench}` : "";
     return h("li", {}, h("span", { class: `tag ${kind}` }, words), ` ${when(e.started_utc)}: ${e.stored_views} of ${counted(e.planned_views, "view")}${bench}`);
   }));
-  $("turn").hidden = !one.views_taken.length;
-  if (one.views_taken.length) $("turn").show(one.name, one.views_taken);
+  $("viewer").hidden = !one.views_taken.length;
+  if (one.views_taken.length) $("viewer").show(one.name, one.views_taken);
   const measured = one.views_taken.filter((view) => view.evidence.sharpness !== undefined);
   const line = (name, key, colour) => ({ name, colour, points: measured.map((view) => [view.azimuth_deg, view.evidence[key]]).sort((a, b) => a[0] - b[0]) });
   $("meters").replaceChildren(...(measured.length > 1 ? [h("h3", { class: "wide" }, "Sharpness and brightness around the object"), lineChart([line("sharpness", "sharpness", "c0"), line("brightness", "mean_level", "c1")], { label: "Sharpness and brightness of the views by angle", zero: true, high: 190 })] : []));

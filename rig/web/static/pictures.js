@@ -81,27 +81,27 @@ customElements.define("rig-live", RigLive);
 // -- an object that turns ------------------------------------------------------------------------------------------------
 
 /** The enrolled views of an object: drag, use the slider or the arrow keys to turn it. It tells which view is shown. */
-class RigTurn extends HTMLElement {
+class RigViewer extends HTMLElement {
   show(name, views) {
     this.views = [...views].sort((a, b) => a.azimuth_deg - b.azimuth_deg);
     this.image = h("img", { alt: `${name}, turned`, draggable: "false" });
     this.overlay = h("svg", { "aria-hidden": "true" });
     this.words = h("p", { class: "number" });
-    this.slider = h("input", { type: "range", min: 0, max: this.views.length - 1, step: 1, "aria-label": "Side of the object", oninput: () => this.turn(Number(this.slider.value)) });
+    this.slider = h("input", { type: "range", min: 0, max: this.views.length - 1, step: 1, "aria-label": "Side of the object", oninput: () => this.showPlace(Number(this.slider.value)) });
     const frame = h("div", { class: "picture", style: "cursor: grab; touch-action: pan-y" }, this.image, this.overlay);
     this.replaceChildren(frame, this.slider, this.words);
     frame.addEventListener("pointerdown", (event) => {
       const [from, first] = [event.clientX, this.place];
       frame.setPointerCapture(event.pointerId);
-      frame.onpointermove = (move) => this.turn(first + Math.round(((move.clientX - from) / frame.clientWidth) * this.views.length));
+      frame.onpointermove = (move) => this.showPlace(first + Math.round(((move.clientX - from) / frame.clientWidth) * this.views.length));
       frame.onpointerup = () => { frame.onpointermove = null; };
       frame.onpointercancel = frame.onpointerup;
     });
     for (const view of this.views) new Image().src = viewPicture(view.id); // so that it turns without waiting
-    this.turn(0);
+    this.showPlace(0);
   }
 
-  turn(place) {
+  showPlace(place) {
     const count = this.views.length;
     this.place = ((place % count) + count) % count;
     const view = this.views[this.place];
@@ -110,7 +110,7 @@ class RigTurn extends HTMLElement {
     this.slider.setAttribute("aria-valuetext", `${view.azimuth_deg.toFixed(0)}°`);
     this.words.textContent = `${view.azimuth_deg.toFixed(0)}°`;
     this.overlay.replaceChildren();
-    this.dispatchEvent(new CustomEvent("turn", { detail: view }));
+    this.dispatchEvent(new CustomEvent("view", { detail: view }));
   }
 
   /** Draw a silhouette over the picture: its points, and the size of the picture that they belong to. */
@@ -119,7 +119,7 @@ class RigTurn extends HTMLElement {
     this.overlay.replaceChildren(...points.map((part) => h("polygon", { points: part.map((point) => point.join(",")).join(" "), fill: "none", stroke: "#ffd34d", "stroke-width": 2, "vector-effect": "non-scaling-stroke" })));
   }
 }
-customElements.define("rig-turn", RigTurn);
+customElements.define("rig-viewer", RigViewer);
 
 // -- charts --------------------------------------------------------------------------------------------------------------
 
@@ -135,8 +135,8 @@ export function pathDrawing(azimuths) {
   azimuths.forEach((azimuth, k) => {
     if (k) {
       const before = azimuths[k - 1];
-      const turn = ((azimuth - before + 540) % 360) - 180;
-      const arc = Array.from({ length: 25 }, (_, n) => point(38 + step * (k - 1 + n / 24), before + (turn * n) / 24));
+      const rotation = ((azimuth - before + 540) % 360) - 180;
+      const arc = Array.from({ length: 25 }, (_, n) => point(38 + step * (k - 1 + n / 24), before + (rotation * n) / 24));
       parts.push(h("path", { class: "step", d: arc.map(([x, y], n) => `${n ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("") }));
     }
   });
@@ -158,7 +158,7 @@ export function lineChart(series, { label, unit = "", high = 150, zero = false }
   const [x0, x1] = [Math.min(...xs), Math.max(...xs)];
   const X = (x) => 48 + (460 * (x - x0)) / (x1 - x0 || 1);
   const Y = (y) => 12 + ((high - 30) * (top - y)) / (top - low);
-  const parts = [low, top].flatMap((y) => [h("line", { x1: 48, x2: 508, y1: Y(y), y2: Y(y), class: "grid" }), h("text", { x: 42, y: Y(y) + 4, "text-anchor": "end", class: "axis" }, `${number(y, Math.abs(top - low) < 3 ? 1 : 0)}${unit}`)]);
+  const parts = [low, top].flatMap((y) => [h("line", { x1: 48, x2: 508, y1: Y(y), y2: Y(y), class: "grid" }), h("text", { x: 42, y: Y(y) + 4, "text-anchor": "end", class: "axis" }, `${number(y, Math.max(0, Math.ceil(1 - Math.log10(top - low))))}${unit}`)]);
   for (const one of series) {
     let pen = "M";
     const d = one.points.map(([x, y]) => { if (y === null || y === undefined) { pen = "M"; return ""; } const text = `${pen}${X(x).toFixed(1)} ${Y(y).toFixed(1)}`; pen = "L"; return text; }).join("");

@@ -42,7 +42,7 @@ const OUTCOMES = { found: (name) => `identified ${name}`, unknown: () => "identi
 const SENTENCES = {
   "enrollment started": ({ object_name: name, details }) => `began to enroll ${name}${details.replace ? " again" : ""}, ${counted(details.views, "view")}`,
   "enrollment resumed": ({ object_name: name }) => `continued the enrollment of ${name}`,
-  "enrollment abandoned": ({ object_name: name }) => `gave up an enrollment of ${name}`,
+  "enrollment abandoned": ({ object_name: name }) => `ended an enrollment of ${name}`,
   "enrollment discarded": ({ object_name: name }) => `discarded an enrollment of ${name}`,
   "enrollment superseded": ({ object_name: name }) => `replaced the earlier enrollment of ${name}`,
   enrolled: ({ object_name: name, details }) => `enrolled ${name} with ${counted(details.views, "view")}`,

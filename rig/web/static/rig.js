@@ -432,13 +432,15 @@ const placeOf = (id) => Number(id.split("-").at(-1));
 export function followJob(kinds, { begin, event, render }) {
   let shown = null;
   let waiting = null; // events that came while those before them are loaded
+  let opened = 0;
   async function open(job) {
+    const mine = (opened += 1);
     shown = job;
     waiting = [];
     begin(job);
     render(job, false);
     const { items, last } = await eventsOf(job).catch(() => ({ items: [], last: "0" }));
-    if (shown.id !== job.id) return;
+    if (mine !== opened) return; // another job was opened meanwhile, or this one again
     for (const one of items) event(one, shown);
     for (const [one, id] of waiting) if (placeOf(id) > placeOf(last)) event(one, shown);
     waiting = null;
