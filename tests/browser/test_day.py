@@ -51,28 +51,25 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     assert page.locator("#thumbs img").count() == 8
     fits()
     tray = tmp_path / "tray.csv"
-    tray.write_text('name,label,note,views\nmug-star,kitchen,"has a star, red",8\nmug-whit,kitchen,,8\n')
+    tray.write_text('name,label,note,views\nmug-star,kitchen,"has a star, red",8\nteapo,kitchen,,8\n')
     page.set_input_files("#file", tray)
-    page.fill("#rows input[aria-label='name of mug-whit']", "mug-white")  # the list can be corrected
+    page.fill("#rows input[aria-label='name of teapo']", "teapot")  # the list can be corrected
     page.click("#tray-start")
-    for name in ("mug-star", "mug-white"):
+    for name in ("mug-star", "teapot"):
         page.wait_for_selector(f".question:has-text('put {name} (kitchen) on the table')", timeout=WAIT_MS)
         page.click(".question button:has-text('Continue')")
     page.wait_for_selector("#said:has-text('The tray is enrolled')", timeout=WAIT_MS)
     assert page.locator("#rows .tag:has-text('enrolled')").count() == 2
-    page.wait_for_selector("#similar-title:has-text('mug-white looks like mug-star')")
-    assert page.locator("#similar figure img").count() == 4
     # Identify. After a reload of the page, answer, candidates and steps are still there.
     page.goto(f"{server.url}identify")
     page.fill("#sample", "S-1")
     page.click("#go")
     for _ in range(2):
         page.wait_for_selector("#answer.found:has-text('mug-star')", timeout=WAIT_MS)
-        page.wait_for_function("document.querySelector('#enrolled img').naturalWidth > 0")
+        page.locator("#enrolled img").evaluate("(image) => image.decode()")
         assert "mug-star" in page.get_attribute("#enrolled img", "alt")
         page.wait_for_selector("#candidates li:has-text('mug-star')")
         page.wait_for_selector("#steps li:has-text('View 1: looks like')")
-        page.wait_for_selector("#twin-title:has-text('mug-star and mug-white differ most here')")
         page.wait_for_selector("#last li:has-text('S-1')")
         fits()
         page.reload()
@@ -80,7 +77,7 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     page.goto(f"{server.url}runs")
     page.click("#answers button:has-text('Details')")
     page.click("dialog button:has-text('Correct it')")
-    page.select_option("#right-object", "mug-white")
+    page.select_option("#right-object", "teapot")
     page.fill("#right-reason", "the label was read")
     page.click("dialog button:has-text('Save')")
     page.wait_for_selector("#answers td:has-text('corrected, was mug-star')")
@@ -306,6 +303,8 @@ def test_pages_pass_axe(page, serve_process):
         page.fill("#name", name)
         page.click("#go:not([disabled])")
         enrolled(page, name)
+    page.wait_for_selector("#similar-title:has-text('mug-white looks like mug-star')")
+    assert page.locator("#similar figure img").count() == 4
     page.goto(f"{server.url}identify")
     page.click("#go")
     page.wait_for_selector("#answer.found, #answer.ambiguous, #answer.unknown", timeout=WAIT_MS)

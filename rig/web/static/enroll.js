@@ -1,4 +1,4 @@
-import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table } from "./rig.js";
+import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table, valuesOf } from "./rig.js";
 import { pathDrawing, picture, viewPicture } from "./pictures.js";
 import "./shelf.js";
 
@@ -6,20 +6,28 @@ import "./shelf.js";
 
 let known = null;
 let asking = null;
+let again = false; // whether an interrupted enrollment is started again instead of continued
 
 /** Say that the name exists, and offer what can be done: continue, replace, another name. */
 async function checkName() {
   const name = $("name").value.trim();
   known = name ? await get(`/objects/${at(name)}`).catch(() => null) : null;
-  const unfinished = known !== null && known.unfinished_views !== null;
+  const unfinished = !again && known !== null && known.unfinished_views !== null;
   $("resume").value = String(unfinished);
-  $("replace").value = String(known !== null && !unfinished && known.views > 0);
+  $("replace").value = String(known !== null && !unfinished);
   $("exists").hidden = known === null;
   $("go").textContent = unfinished ? "Continue the enrollment" : known ? "Enroll again" : "Enroll";
-  if (unfinished) $("exists").replaceChildren(h("p", {}, `Its enrollment was interrupted. ${counted(known.unfinished_views, "view")} of it are stored; the others will be taken. `, h("button", { type: "button", class: "link", onclick: () => { $("resume").value = "false"; $("replace").value = "true"; $("go").textContent = "Start again"; } }, "Start again instead")));
+  if (unfinished) $("exists").replaceChildren(h("p", {}, `Its enrollment was interrupted. ${counted(known.unfinished_views, "view")} of it are stored; the others will be taken. `, h("button", { type: "button", class: "link", onclick: () => { again = true; checkName(); } }, "Start again instead")));
+  else if (again) $("exists").replaceChildren(h("p", {}, "The views that are stored will be replaced."));
   else if (known) $("exists").replaceChildren(h("p", {}, `${name} is enrolled with ${counted(known.views, "view")}. Its new views replace them when they are complete.`));
 }
-$("name").addEventListener("input", () => { clearTimeout(asking); asking = setTimeout(checkName, 250); });
+$("name").addEventListener("input", () => { again = false; clearTimeout(asking); asking = setTimeout(checkName, 250); });
+$("one").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  clearTimeout(asking);
+  await checkName(); // what was known about the name before may have changed
+  submit({ kind: "enroll", ...valuesOf($("one")) });
+});
 const wanted = new URLSearchParams(location.search).get("name");
 if (wanted) {
   $("name").value = wanted;

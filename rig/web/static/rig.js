@@ -139,7 +139,7 @@ export async function act(action) {
 export const submit = (values) => act(() => request("POST", "/jobs", values));
 
 /** Return the values of a form by the names of its fields. An empty field is null. */
-function valuesOf(form) {
+export function valuesOf(form) {
   const value = (field) => {
     if (field.type === "checkbox") return field.checked;
     if (field.value === "") return null;
@@ -393,7 +393,7 @@ export function showJob(box, job, withOutcome = true) {
     parts.push(h("progress", { max: job.progress.total, value: job.progress.done, "aria-label": words }), h("p", { class: "soft" }, words));
   }
   if (job.question) {
-    const sample = job.question.asks === "sample" ? h("input", { "aria-label": "Sample", maxlength: 100, autocomplete: "off", onkeydown: (event) => { if (event.key === "Enter") post("answer", { choice: "continue", sample: event.target.value || null })(); } }) : null;
+    const sample = job.question.takes_sample ? h("input", { "aria-label": "Sample", maxlength: 100, autocomplete: "off", onkeydown: (event) => { if (event.key === "Enter") post("answer", { choice: "continue", sample: event.target.value || null })(); } }) : null;
     const buttons = job.question.choices.map((choice) => h("button", { class: choice === "continue" ? "" : "quiet", onclick: () => post("answer", sample && choice === "continue" ? { choice, sample: sample.value || null } : { choice })() }, CHOICES[choice]));
     parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), sample, h("p", {}, ...nextSteps(job.question.steps)), h("div", { class: "row" }, ...buttons)));
   }
@@ -409,7 +409,7 @@ export function showJob(box, job, withOutcome = true) {
   if (withOutcome && job.error) parts.push(h("div", { class: "failure" }, h("p", { class: "error" }, job.error.what), h("p", {}, ...nextSteps(job.error.steps)), h("p", { class: "small soft" }, `Error ${job.error.code}`)));
   if (job.resume && withOutcome) parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
   box.replaceChildren(...parts);
-  if (job.question?.asks === "sample") box.querySelector(".question input").focus();
+  if (job.question?.takes_sample) box.querySelector(".question input").focus();
   return undefined;
 }
 
