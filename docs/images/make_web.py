@@ -40,7 +40,8 @@ def main() -> None:
 def photograph(page: Any, url: str) -> None:
     """Enroll some objects, identify some, and take the pictures."""
 
-    def take(name: str, scheme: str = "light") -> None:
+    def take(name: str, scheme: str = "light", from_px: int = 0) -> None:
+        page.evaluate(f"scrollTo(0, {from_px})")
         page.emulate_media(color_scheme=scheme)
         page.wait_for_timeout(1500)  # until all pictures are there
         page.evaluate("document.activeElement.blur()")
@@ -56,14 +57,14 @@ def photograph(page: Any, url: str) -> None:
     page.wait_for_selector("#job:has-text('Empty-table image – done')", timeout=WAIT_MS)
     put("mug-white")
     page.wait_for_selector("#tour .now:has-text('Enroll it')")
-    take("bench")
+    take("bench", from_px=420)
     page.goto(f"{url}enroll")
     for name in ("mug-star", "lamp", "toy-car", "teapot", "mug-white"):
         put(name)
         page.fill("#name", name)
         page.click("#go:not([disabled])")
         if name == "teapot":
-            page.wait_for_selector("#thumbs li:nth-child(15)", timeout=WAIT_MS)
+            page.wait_for_selector("#views-title:has-text('15 views')", timeout=WAIT_MS)
             take("enroll")
         page.wait_for_selector(f"#said:has-text('{name} is enrolled')", timeout=WAIT_MS)
     page.goto(f"{url}identify")
@@ -86,7 +87,6 @@ def photograph(page: Any, url: str) -> None:
     page.click("#go")
     page.wait_for_selector("#answer.calm", timeout=WAIT_MS)
     page.wait_for_selector("#answer.unknown", timeout=WAIT_MS)
-    page.evaluate("scrollTo(0, 0)")
     take("phone", "dark")
 
 

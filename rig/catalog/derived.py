@@ -26,7 +26,7 @@ from rig.catalog.facts import Enrollment, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, finished, processes
 from rig.catalog.records import Region
 from rig.config import ViewConfig
-from rig.core.errors import CatalogDamaged, CatalogError
+from rig.core.errors import CatalogDamaged, CatalogError, ObjectNotFound
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber, within
@@ -117,7 +117,7 @@ def silhouette(catalog: Catalog, name: str, index: int) -> NDArray[np.bool_]:
     """
     enrollment = catalog.object(name).complete
     if enrollment is None or not 0 <= index < len(enrollment.views):
-        raise CatalogError(f"{name!r} has no such view.", next_step=Do.LIST_OBJECTS())
+        raise ObjectNotFound(f"{name!r} has no such view.", next_step=Do.LIST_OBJECTS())
     ((view, cut),) = _segmented(catalog, enrollment, name, [index])
     height, width = within(catalog.read_image(view.image), view.region).shape[:2]
     return cut.frame_mask(width, height)

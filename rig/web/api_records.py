@@ -12,7 +12,7 @@ from rig.bench.changes import set_key
 from rig.config.toml_file import NONE, Key, toml
 from rig.config.values import read_values
 from rig.config.wording import key_info
-from rig.core.errors import Forbidden, JobNotFound
+from rig.core.errors import ConfigError, Forbidden, JobNotFound, UsageError
 from rig.core.json_form import plain
 from rig.core.masking import masked
 from rig.core.next_steps import Do
@@ -125,7 +125,10 @@ def add_records(routes: Routes, server: Server) -> None:
                 f"A page cannot change {key}.",
                 next_step=("At a terminal of the bench's computer:", Do.SET_KEY(key=key, value="VALUE")),
             )
-        return {"changed": set_key(file, key, NONE if body.value is None else toml(body.value))}
+        try:
+            return {"changed": set_key(file, key, NONE if body.value is None else toml(body.value))}
+        except ConfigError as error:  # of this request, not of the server
+            raise UsageError(error.what, next_step=error.steps, evidence=error.evidence) from error
 
 
 def _at(values: Any, key: Key) -> Any:
