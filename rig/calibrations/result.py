@@ -34,6 +34,11 @@ class Estimate:
     uncertainty: FiniteFloat
     unit: str
 
+    @property
+    def expanded(self) -> str:
+        """The expanded uncertainty U = k·u with k = 2: about 95 % of a normal distribution (JCGM 100:2008, 6.2)."""
+        return in_unit(f"{2 * self.uncertainty:.2g}", self.unit) if self.uncertainty > 0 else ""
+
     def __str__(self) -> str:
         """Return value and uncertainty to two digits of the uncertainty."""
         if not self.uncertainty > 0:
@@ -105,8 +110,13 @@ class CalibrationResult:
         """The name by which a stored view refers to the result."""
         return f"{self.name}@{self.when_utc:%Y%m%dT%H%M%S.%fZ}"
 
+    @property
+    def valid_until(self) -> datetime | None:
+        """The time from which the result has expired; None if it never does."""
+        return None if self.valid_days is None else self.when_utc + timedelta(days=self.valid_days)
+
     def expired(self, now_utc: datetime) -> bool:
-        return self.valid_days is not None and now_utc - self.when_utc > timedelta(days=self.valid_days)
+        return self.valid_until is not None and now_utc > self.valid_until
 
     def to_file(self, path: Path) -> None:
         """Write the result as JSON, completely or not at all.

@@ -147,6 +147,8 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
     assert [len(drawn) for drawn in pictures] == [1] * 6 + [3, 2]
     assert rig("calibrate", "report", "--out", "page.html").exit_code == 0
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page.count("valid until") == len(results)
+    assert f"U (k = 2) = {results[0].estimates['backlash'].expanded}" in page
     assert page.count("<svg") == sum(map(len, pictures))
     for result, drawn in zip(results, pictures, strict=True):
         assert f'id="{result.name}"' in page

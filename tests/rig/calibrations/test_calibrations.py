@@ -208,3 +208,8 @@ def test_rejection_states_its_numbers():
         str(CalibrationRejection(FEW.code, {**FEW.values, "reasons": []}))
         == "Only 2 reversals can be used, 6 are needed."
     )
+
+
+def test_expanded_uncertainty_is_twice_the_standard_uncertainty():
+    assert Estimate(1.0, 0.0165, "°").expanded == "0.033°"
+    assert Estimate(1.0, 0.0, "°").expanded == ""
