@@ -27,7 +27,18 @@ from rig.web.answers import (
 )
 from rig.web.hub import MAX_LISTENERS
 from rig.web.requests import AnswerBody, ByHand, GotoRequest, Job, JobRequest, LeaseBody, LoginBody
-from rig.web.server import API, COOKIE, OperatorPerson, Page, Proposer, Routes, Server, Watcher, require_operate, schemes
+from rig.web.server import (
+    API,
+    COOKIE,
+    OperatorPerson,
+    Page,
+    Proposer,
+    Routes,
+    Server,
+    Watcher,
+    require_operate,
+    schemes,
+)
 
 IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
@@ -157,7 +168,7 @@ def add_jobs(routes: Routes, server: Server) -> None:
         """List the jobs, the newest first."""
         return page.of(server.remote.call("jobs"), "id")
 
-    @routes.watch.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
+    @routes.propose.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
     def submit_job(
         body: JobRequest, person: Proposer, response: Response, idempotency_key: IdempotencyKey = None
     ) -> Any:
@@ -169,9 +180,7 @@ def add_jobs(routes: Routes, server: Server) -> None:
         if isinstance(body, GotoRequest):  # it would fail later, behind the jobs that wait
             check_angle(body.angle_deg, server.setup.config.table.limits_deg)
         proposed = person.role is Role.PROPOSE
-        job = server.remote.call(
-            "submit", request=body, operator=person.name, key=idempotency_key, proposed=proposed
-        )
+        job = server.remote.call("submit", request=body, operator=person.name, key=idempotency_key, proposed=proposed)
         response.headers["Location"] = f"{API}/jobs/{job['id']}"
         return job
 

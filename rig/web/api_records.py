@@ -7,8 +7,8 @@ from fastapi import Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import Field
 
-from rig.calibrations import CalibrationStore
 from rig.bench.changes import set_key
+from rig.calibrations import CalibrationStore
 from rig.config.toml_file import NONE, Key, toml
 from rig.config.values import read_values
 from rig.config.wording import key_info

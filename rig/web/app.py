@@ -55,7 +55,7 @@ def create_app(server: Server) -> FastAPI:
         add_records,
     ):
         add(routes, server)
-    for router in (routes.public, routes.watch, routes.operate):
+    for router in (routes.public, routes.watch, routes.propose, routes.operate):
         app.include_router(router, prefix=API, responses=_ERRORS)
     app.include_router(pages(server.setup.bench))
     add_reference(app)

@@ -2,6 +2,8 @@
 
 A script fills the pages from the REST API, so that pages and integrators use one interface. A next step without a
 button or link is done at a terminal of the bench's computer; the page then shows its command.
+
+Decision: docs/decisions/0024.
 """
 
 from functools import cache

@@ -176,11 +176,12 @@ def schemes(role: Role) -> list[Any]:
 
 
 class Routes:
-    """The routes of the API by the right that they need: none, to watch, or to operate the bench."""
+    """The routes of the API by the right that they need: none, to watch, to propose a job, or to operate the bench."""
 
     def __init__(self) -> None:
         self.public = APIRouter()
         self.watch = APIRouter(dependencies=[Depends(watcher), *schemes(Role.WATCH)])
+        self.propose = APIRouter(dependencies=[Depends(proposer), *schemes(Role.PROPOSE)])
         self.operate = APIRouter(dependencies=[Depends(operator), *schemes(Role.OPERATE)])
 
 

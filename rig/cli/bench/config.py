@@ -123,8 +123,8 @@ def set_(
 
     Example: rig config set servo.port /dev/ttyUSB1
     """
-    from rig.config import RigConfig
     from rig.bench.changes import set_key
+    from rig.config import RigConfig
     from rig.config.values import FILE_NAME, default_path
     from rig.config.wording import key_info
 

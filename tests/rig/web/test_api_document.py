@@ -58,7 +58,7 @@ def test_each_operation_has_a_plain_name_a_schema_for_its_answer_and_the_right_t
 @pytest.mark.parametrize(
     ("method", "path", "role"),
     [
-        ("post", "/jobs", "operate"),
+        ("post", "/jobs", "propose"),
         ("post", "/lease", "operate"),
         ("delete", "/lease", "watch"),
         ("post", "/stop", "watch"),
