@@ -34,13 +34,6 @@ from sim.servo.device import BOOT_S
 
 LOCK = "lock"
 
-PATIENT: dict[Key, Any] = {("servo", "retries"): 20, ("table", "watchdog_s"): 2.5, ("head", "deadman_s"): 2.0}
-"""Settings of a bench whose devices are a program, which a busy computer pauses for tenths of a second.
-
-A real servo answers within milliseconds however busy the computer is. All repetitions together take less time than the
-servo's watchdog, so a pause that they outlast stops nothing, and one that they do not outlast stops the table.
-"""
-
 
 def run_bench(settings: Settings, folder: Path | None, seconds: float | None) -> None:
     """Run a bench in a folder until it is ended.
@@ -141,16 +134,14 @@ def reserve(folder: Path | None, ends: ExitStack) -> Path:
 def configure(folder: Path, settings: Settings) -> tuple[RigConfig, SimOptions]:
     """Write the folder's rig.toml, with which other programs use the bench; return the configuration in it.
 
-    Its settings are those of the file there, else those of the configuration in force, and `PATIENT` where it says
-    nothing. ``--config`` and ``--set`` of the command line replace them.
+    Its settings are those of the file there, else those of the configuration in force. ``--config`` and ``--set`` of
+    the command line replace them.
 
     Raises `ConfigError`: the configuration has mistakes.
     """
     path = folder / CONFIG
     source = settings.config or (path if path.exists() else default_path())
-    text = read_text(source) if source else blank_file(RigConfig)
-    given = loads(text)
-    changes = {key: value for key, value in PATIENT.items() if key[1] not in given.get(key[0], {})}
+    changes: dict[Key, Any] = {}
     for override in settings.overrides:
         key, _, value = override.partition("=")
         changes[tuple(key.strip().split("."))] = parsed(value)
@@ -163,7 +154,8 @@ def configure(folder: Path, settings: Settings) -> tuple[RigConfig, SimOptions]:
         ("head", "port"): str(folder / HEAD),
         ("bench", "sim-bench", "folder"): str(folder),
     }
-    save(path, with_values(text, changes))
+    text = with_values(read_text(source) if source else blank_file(RigConfig), changes)
+    save(path, text)
     config, kinds = check_config(read_values(path))
     chosen = kinds["sim"]
     assert isinstance(chosen, SimOptions)

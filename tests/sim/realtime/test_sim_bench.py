@@ -40,6 +40,8 @@ from tests.fuzzing import fuzz_settings
 from tests.programs import until
 
 CLOCK = SystemClock()
+PATIENT = ("table.watchdog_s=2.5", "head.deadman_s=2.0", "servo.retries=20")
+"""Settings with which a busy computer may pause this program and the bench."""
 LEFT = {"lock", "rig.toml"}
 """What an ended bench leaves that no program has moved."""
 
@@ -117,7 +119,7 @@ def test_benches_have_their_own_folders_and_clean_them(start):
 
 
 def test_bench_recognises_the_state_of_a_killed_program(start):
-    folder = start("bench", "servo.id=7", "table.limits_deg=[-500, 500]", "head.deadman_s=1.5")
+    folder = start("bench", "servo.id=7", "table.limits_deg=[-500, 500]")
     send_command(folder, "quit")
     until(lambda: {path.name for path in folder.iterdir()} == LEFT)
     (folder / "servo").symlink_to("/dev/pts/no-such-terminal")
@@ -132,8 +134,7 @@ def test_bench_recognises_the_state_of_a_killed_program(start):
     assert ping(start("bench")) == 7  # the settings of the first start
     text = (folder / "rig.toml").read_text()
     assert text.startswith("# mine\n")
-    config = load_config(folder / "rig.toml")
-    assert (config.table.limits_deg, config.table.watchdog_s, config.head.deadman_s) == ((-500, 500), 2.5, 1.5)
+    assert load_config(folder / "rig.toml").table.limits_deg == (-500, 500)
 
 
 @pytest.mark.parametrize("content", ["thesis.txt", "rig.toml"])
@@ -197,7 +198,7 @@ def test_random_bytes_do_not_end_the_bench(start):
 def test_servo_and_rig_head_are_parts_of_one_world(start, monkeypatch):
     needs("memory")
     monkeypatch.setattr("rig.devices.head.link.REPLY_S", 10.0)  # the bench may have to wait for a processor
-    folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5")
+    folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5", *PATIENT)
     config = load_config(folder / "rig.toml")
     assert not send_command(folder, "status")["world"]["light"][0]
     with open_bench("sim-bench", config) as bench:

@@ -17,6 +17,8 @@ from rig.cli.main import main
 main()
 """
 """A terminal sends its signals to the programs that it controls."""
+PATIENT = ("--set", "table.velocity_dps=20", "--set", "servo.retries=10", "--set", "table.watchdog_s=2.4")
+"""The simulated bench answers late on a busy computer."""
 RIGHT, CTRL_C = b"\x1b[C", b"\x03"
 
 
@@ -62,7 +64,7 @@ def test_torque_is_off_however_jog_ends_in_motion(running_sim_bench: Path) -> No
     Program("home", "--here", *config).communicate(30)
     for how, code in (("Ctrl+C", 130), ("hang-up", 128 + signal.SIGHUP), ("kill -9", -signal.SIGKILL), ("q", 0)):
         begun_deg = world()["table_deg"]
-        terminal = Terminal(running_sim_bench, "--step", "90", "--set", "table.velocity_dps=20", *config)
+        terminal = Terminal(running_sim_bench, "--step", "90", *PATIENT, *config)
         terminal.wait_for(b"q end")
         terminal.press(RIGHT)
         # Each answer takes time of the simulated bench.
