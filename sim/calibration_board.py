@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rig.views.charuco_board import CharucoBoard
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 from sim.optics import SUPERSAMPLING, Optics
+from sim.table import TABLE
 
 _BLACK, _WHITE = 25, 215  # levels of the print
 _LEVELS = np.clip(np.arange(256, dtype=np.float32) * (_WHITE - _BLACK) / 255 + _BLACK, 0, 255).astype(np.uint8)
@@ -139,7 +140,9 @@ HOME_MARK = "home-mark"
 
 def home_mark(optics: Optics) -> BoardOnPlatter:
     """Return the card of the home mark: it stands at the edge of the platter, and faces the camera at home."""
-    return BoardOnPlatter(CharucoBoard(4, 3), optics, tilt_deg=10.0, centre_mm=(0.0, -55.0, 30.0), name=HOME_MARK)
+    card = TABLE["home_card"]
+    layout = CharucoBoard(card["columns"], card["rows"])
+    return BoardOnPlatter(layout, optics, tilt_deg=card["tilt_deg"], centre_mm=tuple(card["centre"]), name=HOME_MARK)
 
 
 def boards(optics: Optics) -> dict[str, BoardOnPlatter]:

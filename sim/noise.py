@@ -3,6 +3,8 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
+from sim.table import TABLE
+
 Axes = float | tuple[float, float, float]
 """One number for all axes of a sensor, or one for each."""
 
@@ -31,9 +33,9 @@ class NoiseModel:
     encoder_harmonic_deg: float = 0.0
     """Standard deviation, from part to part, of the encoder's error over a revolution: cosine and sine of its first two
     harmonics (the e-manual states no value; a magnet off the axis gives some tenths of a degree)."""
-    structure_hz: float = 11.0
+    structure_hz: float = TABLE["structure"]["frequency_hz"]
     """Natural frequency of platter and object on the shaft: they ring after each change of acceleration."""
-    structure_damping: float = 0.15
+    structure_damping: float = TABLE["structure"]["damping"]
     """Damping ratio of that ringing, below 1."""
     speed_ripple: float = 0.015
     """Amplitude of the speed's ripple as a share of the speed. The e-manual states no ripple; the default is one unit

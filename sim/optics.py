@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Floats
+from sim.table import TABLE
 from sim.world import World
 
 FOCAL_PX = 1000.0  # a usual lens: the frame is 35° wide
-DISTANCE_MM = 500.0
+DISTANCE_MM: float = TABLE["camera"]["distance"]
 """From the lens to the centre of the platter's top; with the focal length 2 px/mm, as in `sim.objects.projection`."""
 SUPERSAMPLING = 2  # more: less aliasing of fine strokes; each frame takes four times as long at twice the number
 

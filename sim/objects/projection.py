@@ -14,6 +14,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.table import TABLE
+
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -23,7 +25,7 @@ Paint = Callable[[tuple[int, int]], Image]
 
 WIDTH, HEIGHT = 640, 480
 # A camera on a tripod, which sees the top of the platter as an ellipse; `CENTRE_PX` leaves room for objects of 200 mm.
-ELEVATION_DEG = 15.0
+ELEVATION_DEG: float = TABLE["camera"]["tilt_deg"]
 PX_PER_MM = 2.0
 CENTRE_PX = (320, 398)  # where the image shows the centre of the platter's top
 

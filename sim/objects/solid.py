@@ -9,6 +9,7 @@ import numpy as np
 
 from sim.objects.layers import place
 from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Drawing, Floats, Image, ObjectPose
+from sim.table import TABLE
 
 
 class Part(Protocol):
@@ -72,8 +73,9 @@ def _empty_platter() -> Image:
     image = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
     image[:] = (44, 40, 38)
     x, y = CENTRE_PX
-    axes = (int(105 * PX_PER_MM), int(105 * PX_PER_MM * SIN))
-    thickness = int(6 * PX_PER_MM * COS)
+    radius, rim = TABLE["platter"]["radius"], TABLE["platter"]["thickness"]
+    axes = (int(radius * PX_PER_MM), int(radius * PX_PER_MM * SIN))
+    thickness = int(rim * PX_PER_MM * COS)
     for down, colour in ((thickness, (58, 56, 54)), (0, (84, 82, 80))):
         for step in range(thickness if down else 1):
             cv2.ellipse(image, (x, y + down - step), axes, 0, 0, 360, colour, -1, cv2.LINE_AA)
