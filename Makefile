@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 LIBRARY := hbr/kernels/_kernels.so
 
 .NOTPARALLEL:
-.PHONY: FORCE demo web test test-nightly test-kills test-web kernel-test fuzz lint docs wheel bench lock clean test-servers help
+.PHONY: FORCE demo web test test-nightly test-kills test-web kernel-test fuzz lint docs hardware wheel bench lock clean test-servers help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
@@ -24,6 +24,7 @@ help:
 	@echo "make fuzz   attack every kind of input, 5 to 45 minutes (a part of test-nightly)"
 	@echo "make lint   check formatting, lint, types, import contracts and licenses"
 	@echo "make docs   build the documentation as a site in site/"
+	@echo "make hardware  test the printed parts of the table, and write them as STL and STEP to build/hardware"
 	@echo "make wheel  build wheels and sdist in dist/, compare them with a second build, and try the wheel in an empty environment"
 	@echo "make bench  measure speeds, as ratios to other programs"
 	@echo "make clean  remove the files that these commands made"
@@ -84,6 +85,12 @@ docs: $(READY)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --clean
 	@echo "Open site/index.html. With search: python3 -m http.server --directory site"
 
+# The CAD packages are large, so only this target installs them. The pictures: python -m docs.hardware.pictures
+hardware: $(READY)
+	@sh .ci/install .ci/hardware.lock
+	@$(BIN)/python -m pytest -rs -m "" --timeout 600 tests/hardware
+	@$(BIN)/python -m docs.hardware.build build/hardware
+
 wheel: $(READY)
 	@sh .ci/wheel
 
@@ -102,6 +109,8 @@ lock:
 	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
+	echo build123d | uv pip compile - --constraint requirements.lock --universal --python-version 3.11 \
+	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/hardware.lock
 
 $(READY): requirements.lock pyproject.toml
 	@sh .ci/setup "$(PYTHON)" requirements.lock
@@ -119,5 +128,5 @@ $(LIBRARY): FORCE | $(CORE)
 FORCE:
 
 clean:
-	rm -rf $(LIBRARY) .venv .tools rig-demo site dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(LIBRARY) .venv .tools rig-demo site dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

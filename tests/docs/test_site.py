@@ -135,6 +135,14 @@ def test_commands_of_the_attacks_select_tests():
             assert re.search(rf"(def test|class Test|test_)\w*{name}", text), (command, name)
 
 
+def test_tests_of_the_stops_exist():
+    """Each way to stop names the tests that prove it."""
+    found = re.findall(r"`(tests/\S+?)::(\w+)`", (DOCS / "explanation/stops.md").read_text(encoding="utf-8"))
+    assert len(found) > 10
+    for file, name in found:
+        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), (file, name)
+
+
 @pytest.mark.parametrize("file", ["docs/deploy/Dockerfile", ".ci/setup", ".ci/install"])
 def test_every_download_has_a_hash(file):
     """A build without isolation downloads no build backend."""
