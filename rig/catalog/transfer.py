@@ -23,6 +23,7 @@ from rig.catalog.facts import (
     Action,
     Derived,
     Enrollment,
+    Entry,
     Session,
     View,
     digest_of,
@@ -109,7 +110,7 @@ class CatalogSource:
                 enrolled = {one.object_id for one in used}
                 for known in named:
                     if known.object_id not in enrolled:
-                        raise _unfinished(str(known.object_name))
+                        raise _not_enrolled(transaction, known)
                 used = [one for one in used if one.object_id in {known.object_id for known in named}]
             names: set[str] = set()
             for one in used:
@@ -126,8 +127,12 @@ class CatalogSource:
                 yield item
 
 
-def _unfinished(name: str) -> CatalogError:
-    return CatalogError(f"The enrollment of {name!r} is unfinished.", next_step=Do.CONTINUE_ENROLLMENT(name=name))
+def _not_enrolled(transaction: Transaction, known: Entry) -> CatalogError:
+    """Return the error for an object without a complete enrollment: it is unfinished, or was abandoned."""
+    name = str(known.object_name)
+    if state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS) is not None:
+        return CatalogError(f"The enrollment of {name!r} is unfinished.", next_step=Do.CONTINUE_ENROLLMENT(name=name))
+    return CatalogError(f"The enrollment of {name!r} was abandoned.", next_step=Do.ENROLL(name=name))
 
 
 def _check(item: TransferItem) -> None:

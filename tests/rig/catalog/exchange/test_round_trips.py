@@ -14,6 +14,7 @@ from rig.catalog.exchange.bundle import write_bundle
 from rig.catalog.transfer import CatalogSource, Conflict
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectExists
+from rig.core.next_steps import Do
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image
 from tests.rig.catalog.exchange.exchange_samples import facts, import_bundle, model, pictures, run_import, untouched
@@ -38,6 +39,13 @@ class TestBundles:
         with pytest.raises(CatalogError, match="'cup' is unfinished"):
             write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["tin", "cup"]))
         assert not (tmp_path / "a.rigcat.zip").exists()
+
+    def test_abandoned_enrollment_is_to_be_begun_again(self, full: Catalog, tmp_path: Path) -> None:
+        full.resume("cup", provenance=PROVENANCE).abandon()
+        with pytest.raises(CatalogError, match="'cup' was abandoned") as error:
+            write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["cup"]))
+        assert error.value.steps == (Do.ENROLL(name="cup"),)
+        full.begin("cup", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
 
     def test_bundle_contains_the_named_objects(self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path) -> None:
         write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["tin", "Tässe =2+2"]))
