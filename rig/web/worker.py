@@ -221,6 +221,7 @@ class BenchWorker:
         try:
             if self._bench is not None:
                 self._bench.state.clear_stop()  # of an earlier job; `_check_stop` looks for those of this one
+                self._use_hands()
             self._run_job(self, job)
             state = JobState.DONE
         except JobCancelled:
