@@ -210,7 +210,6 @@ class SimShelf:
         operator = self._operator
         match words:
             case ["put", name]:
-                operator.world.put(None)
                 operator.next_object = operator.thing(name, to_identify=True).name
                 operator.place(None)
             case ["clear"]:

@@ -1,11 +1,13 @@
 """Check the computer: the bench's state, ports and permissions, disk and clock."""
 
+import os
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.camera_node import camera_node
 from rig.core.next_steps import Do, SomeSteps
+from rig.devices.dynamixel.port import GUARDIAN
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, graded
 from rig.safety.saved_state import FileStore
@@ -185,12 +187,12 @@ def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPo
 
 def access(context: DoctorContext, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
     """Check that a device file can be opened: no other program uses it, and the user has permission."""
-    if node.holders and not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
-        command = node.holders[0].command
-        fix: SomeSteps = next(
-            (fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {node.holders[0].pid}"
-        )
-        yield FindingCode.DEVICE_FILE_IN_USE(fix, path=node.path, holders=node.holders)
+    # A server that checks its own bench, and the guardian of its port, do not disturb it.
+    others = [one for one in node.holders if one.pid != os.getpid() and GUARDIAN not in one.command]
+    if others and not (context.holder and context.holder.pid in {process.pid for process in others}):
+        command = others[0].command
+        fix: SomeSteps = next((fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {others[0].pid}")
+        yield FindingCode.DEVICE_FILE_IN_USE(fix, path=node.path, holders=others)
         return
     if node.usable:
         yield FindingCode.DEVICE_FILE(path=node.path, name=node.name, stable=node.stable)

@@ -156,7 +156,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
     values: Values = []
     with pytest.MonkeyPatch.context() as patch, starting(folder) as start:
         patch.setattr(BenchWorker, "_idle", wait)
-        served = start(*session.get("settings", ()))
+        served = start(*session.get("settings", ())).opened()
         publish = served.worker.publish
         request: dict[int, str] = {}
 
@@ -167,8 +167,14 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
                 if data["event"] == "accepted" and (path := request.pop(data["picture"] + 1, None)):
                     served.client.post(f"/api/v1/jobs/{data['job']}/{path}")
 
+        def by_hand(thing: str | None) -> None:
+            if thing is not None:
+                served.client.post("/api/v1/shelf", json={"words": ["put", thing]})
+
         served.worker.publish = published
         for step in session["steps"]:
+            shown = iter(step.get("put", ()))  # objects that a person takes from the shelf
+            by_hand(next(shown, None))
             values.append({"request": step["job"]})
             request.clear()
             request.update({step[path]: path for path in ("pause", "cancel") if path in step})
@@ -186,6 +192,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
                     threading.Event().wait(0.005)
                 asked = question
                 values.append({"question": question, "answer": choice})
+                by_hand(next(shown, None))
                 served.client.post(f"/api/v1/jobs/{job}/answer", json={"choice": choice})
             values.append({"ended": served.wait(job)})
         values.append({"status": served.client.get("/api/v1/status").json()})
