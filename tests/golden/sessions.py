@@ -156,7 +156,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
     values: Values = []
     with pytest.MonkeyPatch.context() as patch, starting(folder) as start:
         patch.setattr(BenchWorker, "_idle", wait)
-        served = start(*session.get("settings", ())).opened()
+        served = start(*session.get("settings", ()))
         publish = served.worker.publish
         request: dict[int, str] = {}
 
@@ -169,7 +169,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
 
         def by_hand(thing: str | None) -> None:
             if thing is not None:
-                served.client.post("/api/v1/shelf", json={"words": ["put", thing]})
+                served.worker._hands.append(["put", thing])  # the request would need an open bench
 
         served.worker.publish = published
         for step in session["steps"]:
