@@ -5,6 +5,7 @@ import shutil
 import socket
 import subprocess
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,15 @@ import uvicorn
 
 from rig.web.access import Role
 from rig.web.front import guarded, uvicorn_config
+from tests.rig.web.conftest import Served
 
 NODE = shutil.which("node")
 
 
 @pytest.mark.skipif(NODE is None, reason="node is missing: apt-get install nodejs")
-def test_client_in_another_language_enrolls_identifies_stops_and_understands_an_error(serve):
+def test_client_in_another_language_enrolls_identifies_stops_and_understands_an_error(
+    serve: Callable[..., Served],
+) -> None:
     assert NODE is not None
     served = serve("bench.sim.object='mug-white'", needs_login=True).opened()
     token = served.server.sessions.tokens.new("cell", Role.OPERATE)
