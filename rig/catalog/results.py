@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, and_, func, or_, select
 from sqlalchemy.orm import Session as Transaction
 
@@ -75,6 +76,46 @@ class Correction:
     reason: str
 
 
+class ResultRow(BaseModel):
+    """A result as one row of a table.
+
+    ``outcome``, ``object`` and ``sample`` are those after the last correction. Rotation and probabilities are those of
+    the answer: they are null if a correction names another object. ``confidence`` is null if no object was found;
+    ``not_enrolled`` is the probability that the object is not enrolled, null in searches that know no such probability.
+    """
+
+    model_config = ConfigDict(use_enum_values=True)
+
+    result: int
+    time_utc: datetime
+    sample: str | None
+    outcome: RecordedOutcome
+    object: str | None
+    yaw_deg: float | None
+    yaw_sigma_deg: float | None
+    period_deg: float | None
+    confidence: float | None
+    not_enrolled: float | None
+    score: float | None
+    margin: float | None
+    views: int
+    operator: str
+    user: str
+    host: str
+    bench: str
+    software: str
+    catalog_version: str
+    image: str | None
+    image_sha256: str | None
+    answered_sample: str | None
+    answered_outcome: RecordedOutcome
+    answered_object: str | None
+    corrections: int
+    corrected_utc: datetime | None
+    corrected_by: str | None
+    correction_reason: str | None
+
+
 @dataclass(frozen=True, slots=True)
 class Result:
     """A recorded answer with its corrections, oldest first. ``image`` is the name of the image of its first view."""
@@ -106,38 +147,34 @@ class Result:
         """The answer after the last correction."""
         return self.corrections[-1].corrected if self.corrections else self.answered
 
-    def as_row(self) -> dict[str, Any]:
-        """Return the result as one row of a table.
-
-        Rotation and confidence are those of the answer: they are left out if a correction names another object.
-        """
+    def as_row(self) -> ResultRow:
         now, last = self.current, self.corrections[-1] if self.corrections else None
         same = now[:2] == self.answered[:2]
-        return {
-            "result": self.id,
-            "time_utc": self.time_utc,
-            "sample": now.sample,
-            "outcome": now.outcome.value,
-            "object": now.object_name,
+        return ResultRow(
+            result=self.id,
+            time_utc=self.time_utc,
+            sample=now.sample,
+            outcome=now.outcome,
+            object=now.object_name,
             **{name: _number(self.details, name) if same else None for name in _OF_ITS_OBJECT},
             **{name: _number(self.details, name) for name in ("score", "margin")},
-            "views": len(self.azimuths_deg),
+            views=len(self.azimuths_deg),
             **{name: getattr(self, name) for name in ("operator", "user", "host")},
             **{name: getattr(self.provenance, name) for name in ("bench", "software")},
-            "catalog_version": self.catalog_version,
-            "image": self.image_path,
-            "image_sha256": self.image_sha256,
-            "answered_sample": self.answered.sample,
-            "answered_outcome": self.answered.outcome.value,
-            "answered_object": self.answered.object_name,
-            "corrections": len(self.corrections),
-            "corrected_utc": last and last.time_utc,
-            "corrected_by": last and last.operator,
-            "correction_reason": last and last.reason,
-        }
+            catalog_version=self.catalog_version,
+            image=self.image_path,
+            image_sha256=self.image_sha256,
+            answered_sample=self.answered.sample,
+            answered_outcome=self.answered.outcome,
+            answered_object=self.answered.object_name,
+            corrections=len(self.corrections),
+            corrected_utc=last and last.time_utc,
+            corrected_by=last and last.operator,
+            correction_reason=last and last.reason,
+        )
 
 
-_OF_ITS_OBJECT: Final = ("yaw_deg", "yaw_sigma_deg", "period_deg", "confidence")
+_OF_ITS_OBJECT: Final = ("yaw_deg", "yaw_sigma_deg", "period_deg", "confidence", "not_enrolled")
 
 
 @dataclass(frozen=True, slots=True)

@@ -274,6 +274,9 @@ def reason_words(answer: Identified) -> str:
             return answer.note
         case StopReason.MAX_VIEWS if answer.not_enrolled is None:
             return f"the search took all {counted(answer.views, 'view')} that are allowed"
+        case StopReason.CONFIDENT if answer.outcome is Outcome.UNKNOWN and answer.min_score is not None:
+            # The share is that among the enrolled objects: it says nothing about an object that is not enrolled.
+            return f"the score {answer.score:.3f} of the likeliest object is below {answer.min_score:.3f}"
     share = answer.candidates[0].probability if answer.confidence is None else answer.confidence
     numbers = (share, answer.not_enrolled, answer.min_confidence)
     share, not_enrolled, least = (nan if number is None else number for number in numbers)

@@ -9,9 +9,14 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Discriminator, GetJsonSchemaHandler, PlainSerializer, RootModel
 from pydantic_core import CoreSchema
 
+from rig.catalog.facts import Action
 from rig.catalog.records import EnrollmentStatus, RecordedOutcome
+from rig.catalog.results import ResultRow
+from rig.devices.camera import CameraIdentity
 from rig.events.events import DESCRIBED, Event, JsonEvent
+from rig.safety.supervisor import TableState
 from rig.web.access import Role
+from rig.web.problems import Problem
 
 Row = TypeVar("Row")
 
@@ -66,12 +71,125 @@ class Me(Login):
     lease: LeaseState
 
 
+Steps = list[str | dict[str, Any]]
+"""What to do next: a text for what only hands can do, an object for an action of the rig."""
+
+
+class ErrorBody(BaseModel):
+    """An error as ``rig --json`` prints it; ``error`` is its title."""
+
+    error: str
+    code: int
+    what: str
+    evidence: dict[str, Any]
+    next_step: str
+    steps: Steps
+
+
+class FaultBody(BaseModel):
+    """The latched fault, which must be acknowledged before the table moves again."""
+
+    title: str
+    code: int
+    what: str
+    evidence: dict[str, Any]
+    next_step: str
+    steps: Steps
+    utc: str
+
+
+class ServoReading(BaseModel):
+    """The last reading of the servo."""
+
+    model: str
+    load_percent: float
+    voltage_v: float
+    temperature_c: float
+    moving: bool
+
+
+class BenchStatus(BaseModel):
+    """The state of the bench, the data of the messages ``status``.
+
+    ``job`` is the id of the running job. ``error`` says why the bench is not open; then all that only an open bench
+    knows is null. ``problem`` says why the queue could not be stored. ``doubt`` says why the table's angle must be
+    referenced: then ``table_deg`` is null. ``steps`` are the next steps of the operator. ``region`` is the part of the
+    picture that is described: x, y, width and height in pixels.
+    """
+
+    model_config = ConfigDict(extra="forbid", json_schema_serialization_defaults_required=True)
+
+    open: bool = False
+    job: str | None = None
+    error: ErrorBody | None = None
+    problem: Problem | None = None
+    picture_age_s: float | None = None
+    bench: str | None = None
+    state: TableState | None = None
+    fault: FaultBody | None = None
+    doubt: str | None = None
+    steps: Steps | None = None
+    limits_deg: tuple[float, float] | None = None
+    findings: list[str] | None = None
+    camera: CameraIdentity | None = None
+    region: tuple[int, int, int, int] | None = None
+    table_deg: float | None = None
+    velocity_dps: float | None = None
+    servo: ServoReading | None = None
+
+
+class CatalogState(BaseModel):
+    """Whether the catalog's server answers: else ``local_copy_utc`` is the time of the copy that is shown.
+
+    ``waiting`` changes are not delivered yet, for these ``reasons``.
+    """
+
+    local_copy_utc: str | None
+    waiting: int
+    reasons: list[str]
+
+
+class ServerState(BaseModel):
+    """The state of the server: the number of open streams of events."""
+
+    listeners: int
+
+
+class Status(BenchStatus):
+    """The state of the bench, of its server and of its catalog."""
+
+    server: ServerState
+    catalog: CatalogState
+
+
 class Stopped(BaseModel):
     """The answer to STOP: with ``ended``, the torque is off. ``answer`` is null if the bench has not confirmed it."""
 
     ended: bool
     answer: str | None
-    status: dict[str, Any]
+    status: BenchStatus
+
+
+class Move(BaseModel):
+    """A move of the table, from its beginning at ``utc``. Times are seconds since then, angles the table's.
+
+    Each of the ``goals`` is its time, angle, velocity (°/s) and acceleration (°/s²). The lists from ``time_s`` to
+    ``load_percent`` have a value for each reading of the servo, those of the gyro one for each of its samples.
+    ``arrived_s`` is the end of the servo's profile, ``settled_s`` the rest, null if the move failed.
+    """
+
+    utc: str
+    from_deg: float
+    to_deg: float | None
+    arrived_s: float | None
+    settled_s: float | None
+    goals: list[tuple[float, float, float, float]]
+    time_s: list[float]
+    encoder_deg: list[float]
+    profile_deg: list[float | None]
+    load_percent: list[float]
+    gyro_s: list[float]
+    gyro_dps: list[float]
 
 
 Time = Annotated[datetime, PlainSerializer(time_text, when_used="json")]
@@ -140,19 +258,18 @@ class CorrectionRow(BaseModel):
     reason: str
 
 
-class ResultDetails(BaseModel):
-    """A recorded answer, with the fields of a row of ``/results``.
+class ListedResult(ResultRow):
+    """A recorded answer of a list; ``id`` is its number as a text, for ``after``."""
 
-    ``object``, ``outcome`` and ``sample`` are those after the last of the ``history`` of corrections, which is oldest
-    first. ``answer`` is the event `identified` as it was recorded, with the probability ``not_enrolled``.
+    id: str
+
+
+class ResultDetails(ResultRow):
+    """A recorded answer with its row, and the ``history`` of its corrections, the oldest first.
+
+    ``answer`` is the event `identified` as it was recorded.
     """
 
-    model_config = ConfigDict(extra="allow")
-
-    result: int
-    outcome: RecordedOutcome
-    object: str | None
-    sample: str | None
     answer: dict[str, Any]
     history: list[CorrectionRow]
 
@@ -161,6 +278,57 @@ class Deleted(BaseModel):
     """The name of an object that was deleted."""
 
     deleted: str
+
+
+class LogRow(BaseModel):
+    """A line of the catalog's log; passwords in its ``details`` are hidden."""
+
+    id: str
+    time_utc: Time
+    user: str
+    host: str
+    software: str
+    action: Action
+    object_name: str | None
+    details: dict[str, Any]
+
+
+class CalibrationRow(BaseModel):
+    """A calibration that was run, with its worst ``residual`` and the ``limit`` for it, and its values in words.
+
+    ``id`` is the name by which a stored view refers to it.
+    """
+
+    id: str
+    name: str
+    when_utc: Time
+    passed: bool
+    residual: float | None
+    limit: float | None
+    unit: str
+    valid_days: float | None
+    rejections: list[str]
+    values: dict[str, str]
+
+
+class Calibrations(BaseModel):
+    """The calibrations that were run, the newest first.
+
+    ``available`` are those that a job can run, with their titles; ``unreadable`` says which files cannot be read.
+    """
+
+    history: list[CalibrationRow]
+    available: dict[str, str]
+    unreadable: list[str]
+
+
+class RunCheck(BaseModel):
+    """What a saved run gives when it is computed again: the ``differences`` in words, none if all is as saved."""
+
+    views: int
+    decisions: int
+    is_complete: bool
+    differences: list[str]
 
 
 class RunName(BaseModel):

@@ -22,6 +22,8 @@ from rig.web.answers import (
     ListOf,
     Login,
     Me,
+    Move,
+    Status,
     Stopped,
     Svg,
 )
@@ -90,8 +92,8 @@ def add_access(routes: Routes, server: Server) -> None:
 
 
 def add_bench(routes: Routes, server: Server) -> None:
-    @routes.watch.get("/status", tags=["bench"])
-    def get_status() -> dict[str, Any]:
+    @routes.watch.get("/status", tags=["bench"], response_model=Status)
+    def get_status() -> Any:
         """Return the state of the bench, as of the last second."""
         return {
             **server.remote.status,
@@ -144,11 +146,10 @@ def add_bench(routes: Routes, server: Server) -> None:
             raise JobNotFound("The camera has given no frame yet.", next_step="Try again in a second.")
         return Jpeg(content, headers={"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"})
 
-    @routes.watch.get("/moves/last", tags=["bench"])
-    def get_last_move() -> dict[str, Any]:
+    @routes.watch.get("/moves/last", tags=["bench"], response_model=Move)
+    def get_last_move() -> Any:
         """Return the last move of the last job that ended: encoder, servo profile, load and gyro over its time."""
-        values: dict[str, Any] = server.remote.call("last_move")
-        return values
+        return server.remote.call("last_move")
 
 
 async def _send_events(server: Server, socket: WebSocket) -> None:

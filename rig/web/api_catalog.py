@@ -14,11 +14,10 @@ from starlette.background import BackgroundTask
 from rig.catalog import Catalog, ObjectSummary
 from rig.catalog.derived import views
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
-from rig.catalog.exchange.tables import plain_row
 from rig.catalog.jobs import finished
 from rig.catalog.log import shown
 from rig.catalog.records import RecordedOutcome
-from rig.catalog.results import Result, ResultFilter, correct, find_result, find_results
+from rig.catalog.results import Result, ResultFilter, ResultRow, correct, find_result, find_results
 from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
 from rig.core.json_form import plain
@@ -31,7 +30,9 @@ from rig.web.answers import (
     EnrollmentRow,
     Jpeg,
     ListedObject,
+    ListedResult,
     ListOf,
+    LogRow,
     ObjectRow,
     ObjectWithViews,
     ResultDetails,
@@ -152,7 +153,7 @@ def _result(catalog: Catalog, result_id: int) -> Result:
 
 
 def add_results(routes: Routes, server: Server) -> None:
-    @routes.watch.get("/results", tags=["results"], response_model=ListOf[dict[str, Any]])
+    @routes.watch.get("/results", tags=["results"], response_model=ListOf[ListedResult])
     def list_results(
         page: Page,
         sample: Annotated[str | None, Query(max_length=100)] = None,
@@ -162,7 +163,7 @@ def add_results(routes: Routes, server: Server) -> None:
         """List the recorded answers, the newest first. Filters use the corrected values."""
         with server.catalog.open_to_read() as catalog:
             found = find_results(catalog, ResultFilter(sample, object_name, outcome))
-        rows = [{**plain_row(one.as_row()), "id": str(one.id)} for one in found]
+        rows = [{**one.as_row().model_dump(mode="json"), "id": str(one.id)} for one in found]
         return page.of(rows[::-1], "id")
 
     @routes.watch.get("/results/{result_id}", tags=["results"])
@@ -181,7 +182,7 @@ def add_results(routes: Routes, server: Server) -> None:
             )
             for one in found.corrections
         ]
-        return ResultDetails(**plain_row(found.as_row()), answer=found.details, history=history)
+        return ResultDetails(**found.as_row().model_dump(), answer=found.details, history=history)
 
     @routes.watch.get("/results/{result_id}/image", tags=["results"], response_class=Jpeg)
     def get_result_image(request: Request, result_id: Number, full: Full = False) -> Response:
@@ -193,7 +194,7 @@ def add_results(routes: Routes, server: Server) -> None:
             return _image(request, catalog, name, full=full)
 
     @routes.operate.post("/results/{result_id}/correct", tags=["results"])
-    def correct_result(body: CorrectionBody, person: OperatorPerson, result_id: Number) -> dict[str, Any]:
+    def correct_result(body: CorrectionBody, person: OperatorPerson, result_id: Number) -> ResultRow:
         """Correct the object or the sample of an answer, with the reason. The answer itself stays."""
         with server.catalog.open_to_change(person) as catalog:
             _result(catalog, result_id)
@@ -206,9 +207,9 @@ def add_results(routes: Routes, server: Server) -> None:
                 sample=body.sample,
                 operator=person.name,
             )
-            return plain_row(_result(catalog, result_id).as_row())
+            return _result(catalog, result_id).as_row()
 
-    @routes.watch.get("/log", tags=["bench"], response_model=ListOf[dict[str, Any]])
+    @routes.watch.get("/log", tags=["bench"], response_model=ListOf[LogRow])
     def list_log(page: Page) -> Response:
         """List the catalog's log, the newest first."""
         with server.catalog.open_to_read() as catalog:

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from rig.bench.changes import set_key
 from rig.calibrations import CalibrationStore
+from rig.config import RigConfig
 from rig.config.toml_file import NONE, Key, toml
 from rig.config.values import read_values
 from rig.config.wording import key_info
@@ -19,7 +20,7 @@ from rig.core.next_steps import Do
 from rig.events.events import event_dict
 from rig.search.replay import ReplayCheck, check
 from rig.search.saved_run import SavedRun, load_run
-from rig.web.answers import ListOf, RunName, SavedRunBody, time_text
+from rig.web.answers import CalibrationRow, Calibrations, ListOf, RunCheck, RunName, SavedRunBody
 from rig.web.requests import SettingBody
 from rig.web.server import Page, Routes, Server, long_work
 from rig.web.work import calibrations
@@ -61,7 +62,7 @@ def add_records(routes: Routes, server: Server) -> None:
         return HTMLResponse(await long_work(lambda: run_report(load(name))))
 
     @routes.watch.post("/runs/{name}/check", tags=["runs"])
-    async def check_run(name: str) -> dict[str, Any]:
+    async def check_run(name: str) -> RunCheck:
         """Compute every decision of a saved run again from its images."""
 
         def checked() -> ReplayCheck:
@@ -70,35 +71,39 @@ def add_records(routes: Routes, server: Server) -> None:
                 return check(saved)
 
         found = await long_work(checked)
-        return {**plain(found), "differences": [str(difference) for difference in found.differences]}
+        differences = [str(difference) for difference in found.differences]
+        return RunCheck(
+            views=found.views, decisions=found.decisions, is_complete=found.is_complete, differences=differences
+        )
 
     @routes.watch.get("/calibrations", tags=["bench"])
-    def list_calibrations() -> dict[str, Any]:
+    def list_calibrations() -> Calibrations:
         """Return the calibrations in force, and those that a job can run."""
         store = CalibrationStore(server.setup.config.calibration_path(server.setup.bench))
         history = [
-            {
-                "name": one.name,
-                "when_utc": time_text(one.when_utc),
-                "passed": one.passed,
-                "id": one.id,
-                "residual": one.residual,
-                "limit": one.limit,
-                "unit": one.residual_unit,
-                "valid_days": one.valid_days,
-                "rejections": [str(reason) for reason in one.rejections],
-                "values": {key: str(value) for key, value in one.estimates.items()},
-            }
+            CalibrationRow(
+                id=one.id,
+                name=one.name,
+                when_utc=one.when_utc,
+                passed=one.passed,
+                residual=one.residual,
+                limit=one.limit,
+                unit=one.residual_unit,
+                valid_days=one.valid_days,
+                rejections=[str(reason) for reason in one.rejections],
+                values={key: str(value) for key, value in one.estimates.items()},
+            )
             for one in store.history()
         ]
         offered = {name: one.title for name, one in calibrations().items()}
-        return {"history": history[::-1], "available": offered, "unreadable": [str(one) for one in store.unreadable]}
+        unreadable = [str(one) for one in store.unreadable]
+        return Calibrations(history=history[::-1], available=offered, unreadable=unreadable)
 
-    @routes.watch.get("/configuration", tags=["bench"])
-    def get_configuration() -> dict[str, Any]:
+    # It is not checked as a configuration again: a hidden password is none.
+    @routes.watch.get("/configuration", tags=["bench"], responses={200: {"model": RigConfig}})
+    def get_configuration() -> Response:
         """Return the configuration in force, without passwords."""
-        values: dict[str, Any] = masked(server.setup.config.model_dump(mode="json"))
-        return values
+        return JSONResponse(masked(server.setup.config.model_dump(mode="json")))
 
     @routes.watch.get("/settings", tags=["bench"])
     def list_settings() -> dict[str, Any]:

@@ -24,6 +24,7 @@ from rig.core.clock import Clock, seconds_between
 from rig.core.errors import BenchBusy, RigError
 from rig.core.next_steps import Do, steps_as_json, steps_from_json
 from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
+from rig.web.answers import BenchStatus
 
 MAX_BYTES: Final = 64_000_000  # a longer line is no message of the other end
 MAX_UNSENT: Final = 20_000
@@ -173,7 +174,7 @@ class RemoteBench(Link):
         self._state_folder = state_folder
         self._clock = clock
         self._take = received
-        self.status: dict[str, Any] = {"open": False, "job": None, "error": None, "problem": None}
+        self.status: dict[str, Any] = BenchStatus().model_dump()
         """The last known state of the bench."""
         self._newest: tuple[int, bytes] = (0, b"")
         self._age_s: float | None = None

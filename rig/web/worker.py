@@ -26,6 +26,7 @@ from rig.motion.traces import stored
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.safety.stop_channel import StopAnswer, StopListener, listen
 from rig.safety.supervisor import stopped
+from rig.web.answers import BenchStatus
 from rig.web.jobs import JobQueue
 from rig.web.link import Link
 from rig.web.picture import LivePicture, jpeg
@@ -70,8 +71,8 @@ class BenchWorker:
         self.setup = setup
         self.attempts = Attempts(clock)
         """Those to open the catalog."""
-        self.status: dict[str, Any] = {"open": False, "job": None, "error": None, "problem": None}
-        """The last known state of the bench, as JSON values; a new dict after each change."""
+        self.status = BenchStatus()
+        """The last known state of the bench; another one after each change."""
         self.views: dict[str, list[bytes]] = {}
         """Pictures of the last jobs as JPEG."""
         self.charts: dict[str, str] = {}
@@ -408,5 +409,5 @@ class BenchWorker:
                     "moving": state.moving,
                 },
             }
-        self.status = values
-        self.publish("status", values)
+        self.status = BenchStatus.model_validate(values)
+        self.publish("status", self.status)

@@ -12,7 +12,8 @@ from enum import StrEnum
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from types import NoneType
+from typing import Any, Final, get_args
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from rig.catalog.exchange.new_files import new_file, new_folder
 from rig.catalog.facts import View
 from rig.catalog.images import path_of
 from rig.catalog.records import Region
+from rig.catalog.results import ResultRow
 from rig.catalog.transfer import CatalogSource, TransferItem
 from rig.core.errors import ExportFailed, UsageError
 from rig.core.next_steps import Do
@@ -29,6 +31,13 @@ from rig.views.description import PAPER_DESCRIPTOR
 
 TABLE: Final = "views.csv"
 """The table beside the photographs of an export."""
+
+
+def _column(annotation: Any) -> type:
+    """Return the type of a column of a table from the type of a field."""
+    (kind,) = set(get_args(annotation) or [annotation]) - {NoneType}
+    return str if issubclass(kind, str) else kind
+
 
 _ANGLES: Final = ("azimuth_deg", "commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
 VIEWS: Final[Mapping[str, type]] = {
@@ -42,19 +51,8 @@ VIEWS: Final[Mapping[str, type]] = {
 }
 """Columns of a table of views and their types."""
 
-RESULTS: Final[Mapping[str, type]] = {
-    "result": int,
-    "time_utc": datetime,
-    **dict.fromkeys(("sample", "outcome", "object"), str),
-    **dict.fromkeys(("yaw_deg", "yaw_sigma_deg", "period_deg", "confidence", "score", "margin"), float),
-    "views": int,
-    **dict.fromkeys(("operator", "user", "host", "bench", "software", "catalog_version", "image", "image_sha256"), str),
-    **dict.fromkeys(("answered_sample", "answered_outcome", "answered_object"), str),
-    "corrections": int,
-    "corrected_utc": datetime,
-    **dict.fromkeys(("corrected_by", "correction_reason"), str),
-}
-"""Columns of `Result.as_row` and their types."""
+RESULTS: Final[Mapping[str, type]] = {name: _column(field.annotation) for name, field in ResultRow.model_fields.items()}
+"""Columns of a table of results and their types."""
 
 _ROW_GROUP: Final = 10_000
 """Rows of a Parquet table that are in memory at once."""

@@ -50,7 +50,7 @@ def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
     found = _find(settings, filters)
     if settings.json:
         for result in found:
-            settings.print_json(plain_row(result.as_row()))
+            settings.print_json(plain_row(result.as_row().model_dump()))
         return
     if not found:
         print("No results match.")
@@ -88,7 +88,7 @@ def show(settings: Settings, result: ResultArgument) -> None:
     shown["time_utc"] = found.time_utc.isoformat()
     for correction, one in zip(shown["corrections"], found.corrections, strict=True):
         correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
-    lines = {name: value for name, value in plain_row(found.as_row()).items() if value is not None}
+    lines = {name: value for name, value in plain_row(found.as_row().model_dump()).items() if value is not None}
     lines["candidates"] = ", ".join(f"{one['name']} {one['score']:.3f}" for one in found.details.get("candidates", ()))
     for number, one in enumerate(found.corrections, 1):
         sample = f", sample {one.corrected.sample}" if one.corrected.sample else ""
@@ -110,7 +110,7 @@ def export(
     from rig.catalog.exchange.tables import RESULTS, TableFormat, write_rows
 
     form, found = TableFormat.of(target), _find(settings, filters)
-    write_rows(target, form, RESULTS, (result.as_row() for result in found))
+    write_rows(target, form, RESULTS, (result.as_row().model_dump() for result in found))
     settings.say(
         f"Exported {counted(len(found), 'result')} to {target}.",
         {"target": str(target), "format": form, "results": len(found)},

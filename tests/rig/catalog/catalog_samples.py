@@ -80,7 +80,14 @@ def new_result(
 ) -> NewResult:
     values: dict[str, Any] = {
         "answered": Answer(RecordedOutcome(outcome), object_name, sample),
-        "details": {"event": "identified", "yaw_deg": 70.0, "yaw_sigma_deg": 1.5, "confidence": 0.99, "score": 0.9},
+        "details": {
+            "event": "identified",
+            "yaw_deg": 70.0,
+            "yaw_sigma_deg": 1.5,
+            "confidence": 0.99,
+            "not_enrolled": 0.003,
+            "score": 0.9,
+        },
         "azimuths_deg": (0.0, 60.0),
         "provenance": PROVENANCE,
         "catalog_version": "c" * 64,

@@ -84,7 +84,11 @@ def test_correction_keeps_the_answer_and_is_in_the_log(catalog: Catalog) -> None
         (result.user, "it was neither"),
     ]
     row = result.as_row()
-    assert (row["object"], row["answered_object"], row["yaw_deg"], row["confidence"]) == (None, "mug", None, None)
+    assert (row.object, row.answered_object, row.yaw_deg, row.confidence, row.not_enrolled) == (
+        None,
+        "mug",
+        *[None] * 3,
+    )
     assert numbers(catalog, outcome=RecordedOutcome.UNKNOWN) == [1, 3]
     entries = catalog.log()[-5:]
     assert [(entry.action, entry.object_name, entry.details["result"]) for entry in entries] == [
@@ -189,20 +193,20 @@ def test_process_killed_while_recording_leaves_nothing_half_written(tmp_path: Pa
 def test_table_has_a_row_for_each_result(catalog: Catalog, tmp_path: Path) -> None:
     correct(catalog, 1, sample="=1+1", reason='a "quoted" reason')
     results = find_results(catalog)
-    assert list(results[0].as_row()) == list(RESULTS)
+    wanted = [one.as_row().model_dump() for one in results]
     for form in TableFormat:
-        write_rows(tmp_path / f"a.{form}", form, RESULTS, [one.as_row() for one in results])
+        write_rows(tmp_path / f"a.{form}", form, RESULTS, wanted)
     with pytest.raises(ExportFailed, match="exists already"):
-        write_rows(tmp_path / "a.csv", TableFormat.CSV, RESULTS, [one.as_row() for one in results])
+        write_rows(tmp_path / "a.csv", TableFormat.CSV, RESULTS, wanted)
     with (tmp_path / "a.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     loaded = json.loads((tmp_path / "a.json").read_text())
     for row, other, result in zip(rows, loaded, results, strict=True):
         assert row == {key: "" if value is None else str(value) for key, value in other.items()}
         assert other["time_utc"] == result.time_utc.isoformat()
-    assert (loaded[0]["sample"], loaded[0]["answered_sample"]) == ("=1+1", "S-1")
+    assert (loaded[0]["sample"], loaded[0]["answered_sample"], rows[0]["not_enrolled"]) == ("=1+1", "S-1", "0.003")
     parquet = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "a.parquet").to_pylist()
-    assert parquet == [result.as_row() for result in results]
+    assert parquet == wanted
 
 
 def test_full_disk_is_reported_and_earlier_results_are_safe(catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:

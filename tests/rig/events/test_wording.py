@@ -122,6 +122,9 @@ def test_unknown_object_has_the_probability_that_it_is_not_enrolled() -> None:
     likely = tuple(replace(one, probability=0.997) for one in unknown.candidates)
     by_probability = replace(unknown, candidates=likely)  # a hidden Markov model
     assert answer_words(by_probability).endswith("Percentages of candidates are shares among the enrolled objects.")
+    ended = replace(by_probability, reason=StopReason.CONFIDENT, score=0.41, min_score=0.6, min_confidence=0.98)
+    assert "The score 0.410 of the likeliest object is below 0.600. Percentages" in answer_words(ended)
+    assert "confiden" not in answer_words(ended)  # 99.7 % is the share of a wrong object among the enrolled ones
     dense = replace(by_probability, not_enrolled=0.97, reason=StopReason.NOT_ENROLLED)
     assert answer_words(dense).endswith("(score 0.730). Not enrolled with 97.0 %.")
     frame = FrameUsed(3, 30.0, 1.0, 0, "mug-white", 0.997, Outcome.UNKNOWN)

@@ -41,7 +41,7 @@ class Served:
     def opened(self) -> Self:
         """Return the server when its bench is open: before, a stop has no torque to confirm."""
         for _ in range(6000):
-            if self.worker.status.get("open"):
+            if self.worker.status.open:
                 return self
             threading.Event().wait(0.01)
         pytest.fail(f"the bench is not open: {self.worker.status}")

@@ -16,6 +16,7 @@ from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import error_kinds
 from rig.events.events import Event, event_dict, event_of
+from rig.web.answers import ListedResult, LogRow, Move, ServoReading, Status
 from rig.web.app import create_app
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup
@@ -106,7 +107,7 @@ def test_reference_of_a_server_shows_each_operation_and_each_error_without_a_net
     assert not re.search("<script|https?://", page + errors)
 
 
-def test_stream_and_saved_run_send_such_events(serve):
+def test_stream_saved_run_and_lists_have_the_fields_of_the_document(serve):
     served = serve("bench.sim.object='mug-white'")
     for name in ("mug-white", "lamp"):
         served.run(kind="enroll", name=name, views=4)
@@ -119,6 +120,16 @@ def test_stream_and_saved_run_send_such_events(serve):
     for data in (*sent, *saved):
         assert data.keys() - event_dict(event_of(data)).keys() <= {"job", "text", "steps", "picture", "outline_px"}
         assert event_dict(event_of(data)).items() <= data.items()
+
+    get = served.client.get
+    status = get("/api/v1/status").json()
+    assert status.keys() == Status.model_fields.keys()
+    assert (status["open"], status["servo"].keys()) == (True, ServoReading.model_fields.keys())
+    assert get("/api/v1/moves/last").json().keys() == Move.model_fields.keys()
+    for path, row in (("results", ListedResult), ("log", LogRow)):
+        found = get(f"/api/v1/{path}").json()["items"]
+        assert [row.model_validate(one).model_dump(mode="json") for one in found] == found != []
+    assert RigConfig.model_validate(get("/api/v1/configuration").json()) == served.server.setup.config
 
 
 if __name__ == "__main__":

@@ -74,7 +74,9 @@ def request_stop(served: Served) -> StopRequest:
 
 
 def table_deg(served: Served) -> float:
-    return float(served.worker.status["table_deg"])
+    angle_deg = served.worker.status.table_deg
+    assert angle_deg is not None
+    return angle_deg
 
 
 def all_cancelled(served: Served) -> None:
