@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import platformdirs
 from pydantic import Field, ValidationInfo, field_validator
@@ -12,6 +13,7 @@ from rig.config.device_sections import CameraConfig, CameraTimeConfig, HeadConfi
 from rig.config.section import Section
 from rig.config.table_sections import MarkConfig, SafetyConfig, TableConfig
 from rig.config.values import APP, read_values, validate
+from rig.core.masking import masked
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Mode = Literal["auto", "step", "fly"]
@@ -147,6 +149,30 @@ class IdentifyConfig(Section):
         return min_views
 
 
+class ServeConfig(Section):
+    """What the page of the bench shows of other benches."""
+
+    benches: dict[str, str] = Field(
+        default_factory=dict,
+        description="benches of the page Benches: the address of the server of each, by name; a token stands before the "
+        "host, as in token:TOKEN@left.local",
+    )
+
+    @field_validator("benches")
+    @classmethod
+    def _addresses(cls, benches: dict[str, str]) -> dict[str, str]:
+        for name, address in benches.items():
+            try:
+                parts = urlsplit(address)
+                is_server = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+                is_server = is_server and parts.path in ("", "/") and not (parts.query or parts.fragment)
+            except ValueError:  # the port is no number
+                is_server = False
+            if not is_server:
+                raise ValueError(f"{name} needs an address such as http://left.local:8420 (found {masked(address)!r})")
+        return benches
+
+
 class RigConfig(Section):
     """Everything in `rig.toml`."""
 
@@ -177,6 +203,7 @@ class RigConfig(Section):
     catalog: CatalogConfig = CatalogConfig()
     enroll: EnrollConfig = EnrollConfig()
     identify: IdentifyConfig = IdentifyConfig()
+    serve: ServeConfig = ServeConfig()
     bench: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="options of each bench, by name: [bench.sim]"
     )

@@ -72,7 +72,7 @@ class RunWriter:
                 "conditions": dict(bench.conditions),
                 "findings": list(bench.findings),
                 "descriptor": {"name": kind.name, "version": kind.version},
-                "config": (config or bench.config).model_dump(mode="json"),
+                "config": (config or bench.config).model_dump(mode="json", exclude={"serve"}),  # tokens
             }
             write(folder / "run.json", (json.dumps(about, indent=2, default=str) + "\n").encode())
             self._events: TextIO = (folder / "events.jsonl").open("x", encoding="utf-8")

@@ -138,6 +138,22 @@ class BenchStatus(BaseModel):
     servo: ServoReading | None = None
 
 
+class OtherBench(BaseModel):
+    """A bench of the overview. ``problem`` says why its state is not known; then the rest is null.
+
+    ``job`` is the running job, ``answer`` the last answer of a recent identification, both in words; ``answered_utc``
+    is null while that job runs.
+    """
+
+    name: str
+    address: str
+    problem: str | None = None
+    status: BenchStatus | None = None
+    job: str | None = None
+    answer: str | None = None
+    answered_utc: str | None = None
+
+
 class CatalogState(BaseModel):
     """Whether the catalog's server answers: else ``local_copy_utc`` is the time of the copy that is shown.
 

@@ -23,10 +23,12 @@ from rig.web.answers import (
     Login,
     Me,
     Move,
+    OtherBench,
     Status,
     Stopped,
     Svg,
 )
+from rig.web.benches import OtherBenches
 from rig.web.hub import MAX_LISTENERS
 from rig.web.requests import AnswerBody, ByHand, GotoRequest, Job, JobRequest, LeaseBody, LoginBody
 from rig.web.server import (
@@ -92,6 +94,8 @@ def add_access(routes: Routes, server: Server) -> None:
 
 
 def add_bench(routes: Routes, server: Server) -> None:
+    benches = OtherBenches(server.setup.config.serve.benches)
+
     @routes.watch.get("/status", tags=["bench"], response_model=Status)
     def get_status() -> Any:
         """Return the state of the bench, as of the last second."""
@@ -101,6 +105,12 @@ def add_bench(routes: Routes, server: Server) -> None:
             "server": {"listeners": server.hub.listeners},
             "catalog": server.catalog.state,
         }
+
+    @routes.watch.get("/benches", tags=["bench"])
+    async def list_benches() -> ListOf[OtherBench]:
+        """List the benches of the setting `serve.benches`, with state, running job and last answer of each."""
+        found = await benches.overview()
+        return ListOf(items=found, total=len(found), next=None)
 
     @routes.watch.post("/stop", tags=["bench"], response_model=Stopped)
     async def stop() -> Any:

@@ -57,7 +57,7 @@ def create_app(server: Server) -> FastAPI:
         add(routes, server)
     for router in (routes.public, routes.watch, routes.propose, routes.operate):
         app.include_router(router, prefix=API, responses=_ERRORS)
-    app.include_router(pages(server.setup.bench))
+    app.include_router(pages(server.setup.bench, with_others=bool(server.setup.config.serve.benches)))
     add_reference(app)
     app.mount("/static", StaticFiles(packages=[("rig.web", "static"), ("rig.charts", "static")]), name="static")
 

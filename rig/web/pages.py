@@ -77,8 +77,9 @@ def page_actions() -> dict[str, dict[str, Any]]:
     }
 
 
-def pages(bench: str) -> APIRouter:
-    """Return the routes of the pages of a bench."""
+def pages(bench: str, *, with_others: bool) -> APIRouter:
+    """Return the routes of the pages of a bench, and of the overview with others."""
+    shown = PAGES | ({"benches": "Benches"} if with_others else {})
     templates = environment("rig.web", folder="templates")
     shared = {"bench": bench, "actions": page_actions(), "dial": Markup(dial())}
     router = APIRouter(include_in_schema=False)
@@ -88,10 +89,10 @@ def pages(bench: str) -> APIRouter:
 
         @router.get(f"/{name}", response_class=HTMLResponse, name=f"page-{name or 'bench'}")
         def show() -> HTMLResponse:
-            content = template.render(pages=PAGES, current=current, title=title, **shared)
+            content = template.render(pages=shown, current=current, title=title, **shared)
             return HTMLResponse(content, headers={"Cache-Control": "no-cache"})
 
-    for name, title in PAGES.items():
+    for name, title in shown.items():
         page(name, title, name)
     for name, (title, current) in OTHER_PAGES.items():
         page(name, title, current)

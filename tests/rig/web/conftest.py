@@ -15,11 +15,12 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra hbr-rig[web] is not installed")
 
+import uvicorn
 from fastapi.testclient import TestClient
 
 from rig.config import load_config
 from rig.core.clock import SystemClock
-from rig.web.front import guarded
+from rig.web.front import guarded, uvicorn_config
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup
 from rig.web.work import run_job
@@ -107,6 +108,21 @@ def starting(folder: Path) -> Iterator[Callable[..., Served]]:
     yield start
     for _, end in running:
         end()
+
+
+@contextmanager
+def over_http(served: Served) -> Iterator[str]:
+    """Yield the host and port at which a server answers over HTTP."""
+    web = uvicorn.Server(uvicorn_config(guarded(served.server), served.server.setup.listening))
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=web.run, args=([listening],))
+        thread.start()
+        try:
+            yield f"127.0.0.1:{listening.getsockname()[1]}"
+        finally:
+            web.should_exit = True
+            served.server.hub.close()
+            thread.join()
 
 
 @pytest.fixture

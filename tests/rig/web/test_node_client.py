@@ -2,18 +2,14 @@
 
 import json
 import shutil
-import socket
 import subprocess
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import uvicorn
 
 from rig.web.access import Role
-from rig.web.front import guarded, uvicorn_config
-from tests.rig.web.conftest import Served
+from tests.rig.web.conftest import Served, over_http
 
 NODE = shutil.which("node")
 
@@ -25,18 +21,9 @@ def test_client_in_another_language_enrolls_identifies_stops_and_understands_an_
     assert NODE is not None
     served = serve("bench.sim.object='mug-white'", needs_login=True).opened()
     token = served.server.sessions.tokens.new("cell", Role.OPERATE)
-    web = uvicorn.Server(uvicorn_config(guarded(served.server), served.server.setup.listening))
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        thread = threading.Thread(target=web.run, args=([listening],))
-        thread.start()
-        url = f"http://127.0.0.1:{listening.getsockname()[1]}"
-        try:
-            client = [NODE, str(Path(__file__).with_name("client.mjs")), url, token]
-            done = subprocess.run(client, capture_output=True, text=True, timeout=100, check=False)
-        finally:
-            web.should_exit = True
-            served.server.hub.close()
-            thread.join()
+    with over_http(served) as place:
+        client = [NODE, str(Path(__file__).with_name("client.mjs")), f"http://{place}", token]
+        done = subprocess.run(client, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout)
     assert seen["name"] == "mug-white"
