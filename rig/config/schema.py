@@ -154,8 +154,8 @@ class ServeConfig(Section):
 
     benches: dict[str, str] = Field(
         default_factory=dict,
-        description="benches of the page Benches: the address of the server of each, by name; a token stands before the "
-        "host, as in token:TOKEN@left.local",
+        description="benches of the page Benches: the address of the server of each, by name; a token stands before "
+        "the host, as in token:TOKEN@left.local",
     )
 
     @field_validator("benches")

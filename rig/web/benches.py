@@ -70,11 +70,11 @@ def _ask(name: str, address: SplitResult) -> OtherBench:
         answered = next((one for one in jobs if one["request"]["kind"] == "identify" and one["result_text"]), None)
         if answered is not None:
             bench.answer, bench.answered_utc = answered["result_text"].partition("\n")[0], answered["ended_utc"]
-    except (OSError, HTTPException) as error:
-        return _bench(name, address, f"does not answer: {error or type(error).__name__}")
+    except OSError as error:
+        return _bench(name, address, f"does not answer: {error.strerror or error}")
     except _Rejected as error:
         return _bench(name, address, str(error))
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except (HTTPException, ValueError, TypeError, KeyError, AttributeError):
         return _bench(name, address, "is no bench, or has another version")
     finally:
         connection.close()

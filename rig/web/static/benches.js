@@ -1,15 +1,26 @@
 // The overview of several benches; the server asks them.
-import { $, act, h, on, request, start, stateWords, table } from "./rig.js";
+import { $, act, h, on, request, start, stateWords } from "./rig.js";
 
 const EVERY_MS = 3000;
+const cards = new Map(); // they stay, so that a link keeps the focus
+
+function card({ name, address }) {
+  const parts = { state: h("p"), job: h("p"), answer: h("p") };
+  $("benches").append(h("section", {}, h("h2", {}, h("a", { href: address }, name)), parts.state, parts.job, parts.answer));
+  return parts;
+}
 
 async function load() {
-  const { items } = await request("GET", "/benches");
-  table($("benches"), ["Bench", "State", "Job", "Last answer", "Time"], items.map((one) => {
-    const [words, kind] = one.problem ? [one.problem, "bad"] : stateWords(one.status);
-    const time = one.answered_utc ? new Date(one.answered_utc).toLocaleTimeString() : "";
-    return [h("a", { href: one.address }, one.name), h("span", { class: `state ${kind}` }, words), one.job, one.answer, time];
-  }));
+  for (const one of (await request("GET", "/benches")).items) {
+    if (!cards.has(one.name)) cards.set(one.name, card(one));
+    const { state, job, answer } = cards.get(one.name);
+    const [words, kind] = one.problem ? [`This bench ${one.problem}.`, "bad"] : stateWords(one.status);
+    const time = one.answered_utc ? ` (${new Date(one.answered_utc).toLocaleTimeString()})` : "";
+    state.className = kind === "bad" ? "error" : "";
+    state.textContent = words;
+    job.textContent = one.job ? `Job: ${one.job}` : "";
+    answer.textContent = one.answer ? `Last answer: ${one.answer}${time}` : "";
+  }
 }
 
 on("hello", () => act(load));

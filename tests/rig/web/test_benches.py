@@ -10,6 +10,8 @@ from rig.core.errors import ConfigError
 from rig.web.access import Role
 from tests.rig.web.conftest import Served, over_http, starting
 
+SECRET = "rig_never-stored"
+
 
 def test_overview_shows_state_and_last_answer_and_which_bench_does_not_answer(tmp_path: Path) -> None:
     with (
@@ -17,7 +19,8 @@ def test_overview_shows_state_and_last_answer_and_which_bench_does_not_answer(tm
         starting(tmp_path / "here") as serve_here,
         socket.create_server(("127.0.0.1", 0)) as silent,
     ):
-        left = serve_left("bench.sim.object='mug-white'", needs_login=True).opened()
+        right = f"serve.benches.right='http://token:{SECRET}@127.0.0.1:9'"
+        left = serve_left("bench.sim.object='mug-white'", right, needs_login=True).opened()
         token = left.server.sessions.tokens.new("overview", Role.WATCH)
         left.client.headers["Authorization"] = f"Bearer {left.server.sessions.tokens.new('cell', Role.OPERATE)}"
         left.run(kind="enroll", name="mug-white", views=4)
@@ -44,6 +47,8 @@ def test_overview_shows_state_and_last_answer_and_which_bench_does_not_answer(tm
         assert found[name]["problem"].startswith("does not answer")
         assert found[name]["status"] is None
     assert token not in answer.text + configuration
+    assert list(tmp_path.rglob("run.json"))
+    assert not any(SECRET.encode() in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
     assert '<a href="/benches" aria-current="page">Benches</a>' in page
 
 
