@@ -37,6 +37,7 @@ def test_short_benchmarks_run_to_their_end(name: str, last: str, tmp_path: Path)
     assert last in output(name, tmp_path).splitlines()[-1]
 
 
+@pytest.mark.nightly
 def test_views_of_figure_7_have_irregular_angles_that_the_gyro_measured(tmp_path: Path) -> None:
     figure_7.record(tmp_path / "catalog", ("mug-white", "teapot"), seed=1, views=(10, 12))
     with Catalog.open(tmp_path / "catalog", clock=SystemClock(), read_only=True) as catalog:

@@ -116,6 +116,7 @@ def test_show_and_history_list_results(rig, tmp_path, imu_calibration):
     ]
 
 
+@pytest.mark.nightly
 def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch, imu_calibration, servo_calibration):
     # Results of other tests, fewer frames and sides: other tests show what the procedures find.
     known = {result.name: result for folder, _ in (imu_calibration, servo_calibration) for result in results_in(folder)}

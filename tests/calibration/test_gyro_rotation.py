@@ -46,6 +46,7 @@ def test_lost_samples_are_rejected():
     assert not result.estimates
 
 
+@pytest.mark.nightly
 def test_simulated_sigma_is_true(simulated):
     s = simulated(seed=3)
     speed_before = s.bench.config.table.velocity_dps

@@ -133,6 +133,7 @@ def test_loose_board_is_rejected():
     assert RejectionCode.CIRCLES_OFF in codes(axis(views, calibrated(0)))
 
 
+@pytest.mark.nightly
 def test_wrong_gear_ratio_is_rejected():
     views = seen(optics(1), ALL, ANGLES, ratio=1.5)
     assert RejectionCode.BOARD_LOOSE in codes(camera(views))

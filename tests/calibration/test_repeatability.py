@@ -69,6 +69,7 @@ def test_drifting_light_and_another_object_are_rejected():
     assert RejectionCode.SIMILARITY_TOO_LOW in codes(fit(others))
 
 
+@pytest.mark.nightly
 def test_simulated_result_is_applied(simulated):
     s = simulated(seed=1)
     *_, result = Repeatability("teapot", placements=3, error_rate=0.05).live(s.bench)

@@ -1,9 +1,12 @@
 """docs/how-to/add-a-strategy.md"""
 
+import pytest
+
 from rig import Catalog, enroll
 from tests.docs.pages import blocks, run
 
 
+@pytest.mark.nightly
 def test_new_strategies_find_the_object(tmp_path, simulated):
     page = run("\n".join(blocks("add-a-strategy")))
     bench = simulated(seed=3)

@@ -217,6 +217,7 @@ def test_bias_walks_at_the_models_pace() -> None:
     assert np.std(drifts) == pytest.approx(pace * 2, rel=0.15)
 
 
+@pytest.mark.nightly
 def test_flicker_noise_has_one_allan_deviation_at_all_times_however_it_is_read() -> None:
     floor = (0.004, 0.0, 0.001)
     times_ns = np.arange(1, 40_001, dtype=np.int64) * 100_000_000

@@ -109,6 +109,7 @@ def test_fault_replaces_the_object_by_another_one_of_the_photographs(rig: Rig) -
     assert set(colours[4:]) == {COLOURS["obj2"]}  # the third one of the sorted names
 
 
+@pytest.mark.nightly
 def test_demo_enrolls_photographs_and_searches_in_the_others(rig: Rig) -> None:
     save(Path("photographs"), step_deg=22.5)
     done = rig("demo", "--objects", "photographs", "--count", "2", "--json", *put(every=2))

@@ -89,6 +89,7 @@ def test_ambiguous_answers_are_a_count_of_their_own(small, in_json):
     assert "0 of 2 enrolled objects found again, 2 ambiguous;" in (small[1] / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.nightly
 def test_json_names_the_change_of_the_bench(in_json, tmp_path):
     """With marks on the platter, in other light, and with clutter; they do not end the demo."""
     unchanged = json.loads(in_json[0].stdout)

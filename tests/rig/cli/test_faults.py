@@ -46,6 +46,7 @@ def test_a_jam_asks_for_an_acknowledgement_only_where_a_fault_stays_latched(stor
     assert (acknowledged is not None) == stored
 
 
+@pytest.mark.nightly
 def test_changed_bench_is_searched_with_the_faults_of_command_line_and_configuration(tmp_path):
     done = rig(
         *("demo", *SMALL, "--fault", "crc_flip@1s+3s", "--fault", "camera.slow@2s+1s"),

@@ -81,6 +81,7 @@ def test_no_color_works_at_any_position(arguments):
     assert "\x1b[3" not in text  # no colour; bold and dim are allowed
 
 
+@pytest.mark.nightly
 def test_terminal_without_unicode_shows_question_marks(tmp_path):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     done = subprocess.run(

@@ -20,6 +20,7 @@ from rig.views.empty_table import empty_table_status
 from tests.small import SMALL, SMALL_WORDS
 
 
+@pytest.mark.nightly
 def test_enrollment_takes_the_image_once_a_day(rig: Callable[..., Any]) -> None:
     first, second = (rig("enroll", name, "--views", "4") for name in ("dice", "lamp"))
     assert "Empty-table image:" in first.stderr

@@ -62,15 +62,18 @@ def test_passwords_are_masked_in_sentences_and_parameters():
     assert "1234" not in in_words(steps) + str(steps_as_json(steps))
 
 
-def _product() -> Iterator[tuple[str, ast.Module]]:
+def _product(*words: str) -> Iterator[tuple[str, ast.Module]]:
+    """Yield the modules that have one of the words: to parse all of them takes a second."""
     for room in ("rig", "calibration", "sim"):
         for path in (ROOT / room).rglob("*.py"):
-            yield path.relative_to(ROOT).as_posix(), ast.parse(path.read_text())
+            text = path.read_text()
+            if any(word in text for word in words):
+                yield path.relative_to(ROOT).as_posix(), ast.parse(text)
 
 
 def _named_steps() -> Iterator[tuple[Do, set[str]]]:
     """Yield each action that the product names, with the names of its parameters."""
-    for _, module in _product():
+    for _, module in _product("Do."):
         for node in ast.walk(module):
             match node:
                 case ast.Call(func=ast.Attribute(value=ast.Name(id="Do"), attr=name), keywords=keywords):
@@ -108,7 +111,7 @@ def test_no_next_step_names_a_command_in_a_text():
     """A sentence with a command would be shown on a page, to an operator in gloves. Use a member of `Do`."""
     command = re.compile(r"`rig |\brig [a-z-]+( [a-z-]+)? (--|NAME\b)|Ctrl\+C|(?<![\w-])--[a-z]")
     wrong, seen = [], 0
-    for where, module in _product():
+    for where, module in _product("step", "fix"):
         for node in ast.walk(module):
             match node:
                 case ast.keyword(arg="next_step" | "steps", value=value):

@@ -63,7 +63,7 @@ def test_azimuths_agree_whether_object_or_camera_rotates(
 
 @pytest.mark.parametrize(
     ("strategy", "photographs"),
-    [pytest.param("ahbr", False, marks=pytest.mark.nightly), ("dense", False), ("dense", True)],
+    [*(pytest.param(one, False, marks=pytest.mark.nightly) for one in ("ahbr", "dense")), ("dense", True)],
 )
 def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strategy: str, photographs: bool) -> None:
     """The background differs in each view; whole frames (AHBR) and the rig's own search find the object again.
@@ -107,6 +107,7 @@ def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strat
         assert np.array_equal(copy.read_image(session.empty_table), empty_table_status(s.bench).table.image_bgr)
 
 
+@pytest.mark.nightly
 def test_search_by_an_orbiting_camera_goes_where_an_image_was_taken(
     simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

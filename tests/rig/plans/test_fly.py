@@ -178,7 +178,7 @@ def outcome(tmp_path: Path, *faults: str) -> tuple[RigError | None, list[Event],
 MISSING = ("lost_frames:rate=0.4", "doubled_frame", "frozen_frame")
 MISTIMED = ("stamp_jump:ms=15", "stamps_backwards", "stamp_jitter")
 UNRELIABLE = ("camera.slow:fps=10", "camera.intermittent")
-OTHERS = ("camera.delayed", "camera.off", *MISSING, *MISTIMED, *UNRELIABLE)
+LONG = ("camera.stuck", "camera.delayed", "camera.off", *MISSING, *MISTIMED, *UNRELIABLE)
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,8 @@ def test_faulty_frames_leave_only_true_views(tmp_path: Path, kinds: tuple[str, .
     check_true_views(tmp_path, *(f"{kind}@{1.5 + 1.1 * i:.1f}s+0.8s" for i, kind in enumerate(kinds)))
 
 
-@pytest.mark.parametrize("kind", ["camera.stuck", *(pytest.param(one, marks=pytest.mark.nightly) for one in OTHERS)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", LONG)
 def test_long_fault_of_frames_leaves_only_true_views(tmp_path: Path, kind: str) -> None:
     check_true_views(tmp_path, f"{kind}@1.5s+2s")
 
@@ -214,6 +215,7 @@ def test_failed_revolution_stores_no_view(tmp_path: Path, fault: str, kind: type
     assert not any(isinstance(event, Accepted) for event in events)
 
 
+@pytest.mark.nightly
 def test_interrupted_revolution_is_resumed_and_can_be_paused(tmp_path: Path) -> None:
     with flying(tmp_path, *FAST, camera_readout_ms=0.0) as (bench, catalog, _):
         events = enroll(bench, catalog, "block", views=8, fly=True)
@@ -252,6 +254,7 @@ def test_scan_needs_camera_time_and_a_revolution_of_cable(tmp_path: Path) -> Non
         assert not catalog.objects()
 
 
+@pytest.mark.nightly
 def test_trays_fly_if_the_camera_time_is_calibrated(tmp_path: Path) -> None:
     with flying(tmp_path, *FAST, camera_readout_ms=0.0) as (bench, catalog, _):
         tray = list(enroll_tray(bench, catalog, [TrayItem(2, "block")], views=8))

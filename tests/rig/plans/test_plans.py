@@ -61,7 +61,7 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
     assert torque(s) == 0
 
 
-@pytest.mark.parametrize("interrupted_after", [None, 1, pytest.param(5, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("interrupted_after", [1, *(pytest.param(one, marks=pytest.mark.nightly) for one in (None, 5))])
 def test_enrolled_views_are_described_together(simulated, catalog, interrupted_after):
     """The pixels come from memory or from the disk; few views of a session learn the background from all sessions."""
     s = simulated(seed=4)

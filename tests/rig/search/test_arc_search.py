@@ -80,6 +80,7 @@ def test_search_ends_during_the_rotation_and_can_be_replayed(model: Model, tmp_p
     assert len(decisions) < 1 + len(in_motion)
 
 
+@pytest.mark.nightly
 def test_arc_stays_within_the_cable_budget_and_waits_for_a_pause(model: Model) -> None:
     world = World(seed=2)
     angles_deg: list[float] = []
@@ -100,7 +101,12 @@ def test_arc_stays_within_the_cable_budget_and_waits_for_a_pause(model: Model) -
 
 
 @pytest.mark.parametrize(
-    ("how", "kind"), [("Ctrl+C", KeyboardInterrupt), ("rig stop", MotionStopped), ("jam", Stalled)]
+    ("how", "kind"),
+    [
+        ("Ctrl+C", KeyboardInterrupt),
+        pytest.param("rig stop", MotionStopped, marks=pytest.mark.nightly),
+        ("jam", Stalled),
+    ],
 )
 def test_stop_in_an_arc_after_a_pause_switches_the_torque_off_before_anything_else(
     model: Model, how: str, kind: type[BaseException], tmp_path: Path

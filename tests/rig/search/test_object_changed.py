@@ -62,6 +62,7 @@ def of_kind(kind: type[T], events: list[Event]) -> list[T]:
     return [event for event in events if isinstance(event, kind)]
 
 
+@pytest.mark.nightly
 def test_last_steps_use_the_views_of_the_new_object_alone(model: Model, tmp_path: Path) -> None:
     mug = sorted(shelf()).index("mug-star") + 1
     with opened(f"object_moved:other={mug}:angle=90@move1", "object_moved:other=0@move3", yaw_deg=150.0) as bench:
@@ -71,6 +72,7 @@ def test_last_steps_use_the_views_of_the_new_object_alone(model: Model, tmp_path
     assert set(answer.possible) <= {"mug-white", "mug-star"}
 
 
+@pytest.mark.nightly
 def test_less_evidence_is_needed_if_the_gyro_saw_the_platter_move(model: Model) -> None:
     needed = {}
     for faults in ((REPLACED,), (REPLACED, "slip:angle=8@move1")):

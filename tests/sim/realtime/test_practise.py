@@ -78,6 +78,7 @@ def process(*words: str, cwd: Path) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.realtime
 @pytest.mark.parametrize("in_depth", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):

@@ -175,6 +175,7 @@ main()
 """
 
 
+@pytest.mark.nightly
 def test_interrupted_import_leaves_images_only(tmp_path: Path) -> None:
     photographs(tmp_path / "in", "jar", step_deg=5)
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")

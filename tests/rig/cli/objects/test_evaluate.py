@@ -208,6 +208,7 @@ def test_bench_change_searches_for_each_object_also_as_if_it_were_not_enrolled(
         assert {len(one["leaders"]) for one in searches} == {4}, name
 
 
+@pytest.mark.nightly
 def test_photographs_are_searched_for_in_those_that_are_not_enrolled(photographs: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photographs"
     shutil.copytree(photographs, folder)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from rig.catalog import Catalog
@@ -94,6 +95,7 @@ def test_answer_is_printed_even_if_it_cannot_be_recorded(rig, monkeypatch):
     assert "Recorded" not in done.output
 
 
+@pytest.mark.nightly
 def test_closed_pipe_ends_the_command_without_an_error(enrolled):
     folder, _ = enrolled
     command = (
