@@ -1,8 +1,7 @@
 """The printed parts of the table, built from the dimensions of `sim.table`.
 
-Each function returns a solid in the place where it is printed: z is up, and the bed is z = 0. `docs.hardware.assembly`
-says where it stands in the assembly. Its origin is on the desk below the table's axis: x to the camera's right, y away
-from the camera.
+Each function returns a solid as it is printed: z is up, and the bed is z = 0. Its place in the bench is in
+`docs.hardware.assembly`, whose origin is on the desk below the axis: x to the camera's right, y away from the camera.
 """
 
 from collections.abc import Iterable
@@ -181,7 +180,7 @@ def _stand(
     foot: tuple[float, float],
     screws: list[tuple[float, float]],
 ) -> Part:
-    """Return a stand with a slot for a card; its front is at ``centre``: (y, z) from the platter's middle."""
+    """Return a stand with a slot for a card whose front is at ``centre``: (y, z) from the middle of the top."""
     lean = radians(tilt_deg)
     along, back = np.array([sin(lean), cos(lean)]), np.array([cos(lean), -sin(lean)])
     low = np.array(centre) - half * along  # lower edge of the card's front

@@ -19,6 +19,7 @@ from docs.hardware.parts import PLATTER_Z, SERVOS, TABLE, TOP_Z
 from rig.config import RigConfig
 from sim.calibration_board import home_mark
 from sim.optics import Optics
+from sim.servo.models import servo_model
 from tests.docs.pages import DOCS
 
 PRINT = TABLE["print"]
@@ -218,12 +219,14 @@ def test_nothing_collides_through_a_revolution(servo):
 
 
 def test_mass_and_inertia_are_those_of_the_dimensions():
-    """The platter has its 6 mm at the rim, which the simulated camera sees."""
+    """Also: the ringing fits them and the controller, and the rim is as thick as the simulated camera sees it."""
     density = PRINT["density_g_cm3"] * 1e-6
     rotating = [part_of("platter"), part_of("hub-xl430_w250")]
     assert density * sum(part.volume for part in rotating) == pytest.approx(TABLE["platter"]["mass_kg"], rel=0.02)
     inertia = density * 1e-6 * sum(part.matrix_of_inertia[2][2] for part in rotating)
     assert inertia == pytest.approx(TABLE["platter"]["inertia_kg_m2"], rel=0.02)
+    stiffness = (2 * pi * TABLE["structure"]["frequency_hz"]) ** 2 * inertia  # N·m/rad
+    assert stiffness == pytest.approx(1.5 / radians(servo_model("xl430_w250").stall_error_deg), rel=0.25)
     box = part_of("platter").bounding_box()
     assert pytest.approx(TABLE["platter"]["radius"]) == box.size.X / 2
     assert pytest.approx(TABLE["platter"]["thickness"]) == box.size.Z
