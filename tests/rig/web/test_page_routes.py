@@ -102,7 +102,7 @@ def test_bench_whose_objects_are_placed_by_a_script_has_no_shelf(enrolled):
 def test_camera_is_locked_again(serve):
     served = serve("bench.sim.object='lamp'").opened()
     assert served.run(kind="camera", exposure_us=5000, gain=2)["state"] == "done"
-    assert served.worker.status["locks"]["exposure_us"] == pytest.approx(5000, rel=0.1)
+    assert get(served, "status").json()["locks"]["exposure_us"] == pytest.approx(5000, rel=0.1)
     assert served.run(kind="enroll", name="lamp", views=4)["state"] == "done"
 
 
