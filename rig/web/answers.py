@@ -114,7 +114,7 @@ class BenchStatus(BaseModel):
     ``job`` is the id of the running job. ``error`` says why the bench is not open; then all that only an open bench
     knows is null. ``problem`` says why the queue could not be stored. ``doubt`` says why the table's angle must be
     referenced: then ``table_deg`` is null. ``steps`` are the next steps of the operator. ``region`` is the part of the
-    picture that is described: x, y, width and height in pixels.
+    picture that is described: x, y, width and height in pixels. ``locks`` are the settings that the camera holds.
     """
 
     model_config = ConfigDict(extra="forbid", json_schema_serialization_defaults_required=True)
@@ -132,6 +132,7 @@ class BenchStatus(BaseModel):
     limits_deg: tuple[float, float] | None = None
     findings: list[str] | None = None
     camera: CameraIdentity | None = None
+    locks: dict[str, Any] | None = None
     region: tuple[int, int, int, int] | None = None
     table_deg: float | None = None
     velocity_dps: float | None = None
