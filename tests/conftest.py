@@ -33,7 +33,7 @@ from tests.small import SMALL
 
 # Without deadlines, because they measure the computer, not the code; pytest-timeout ends tests that hang. Examples are
 # the same in every clone; `--hypothesis-profile=nightly` searches for new ones.
-settings.register_profile("rig", deadline=None, derandomize=True, database=None, max_examples=15)
+settings.register_profile("rig", deadline=None, derandomize=True, database=None, max_examples=10)
 settings.register_profile("nightly", deadline=None, max_examples=1000)
 settings.load_profile("rig")
 

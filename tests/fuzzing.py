@@ -9,7 +9,7 @@ from typing import NoReturn
 
 from hypothesis import HealthCheck, settings
 
-CASES, NIGHTLY_CASES = 20, 20_000
+CASES, NIGHTLY_CASES = 12, 20_000
 
 
 def fuzz_settings(share: float = 1.0) -> settings:

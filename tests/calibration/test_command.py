@@ -197,7 +197,12 @@ def store(tmp_path, days: float, **device: str) -> None:
     ("days", "device", "words"),
     [
         (100.0, {}, "servo.encoder was calibrated 100 days ago; it is valid for 30 days"),
-        (1.0, {"bench": "another"}, "servo.encoder was calibrated on another device: bench was another, is sim"),
+        pytest.param(
+            1.0,
+            {"bench": "another"},
+            "servo.encoder was calibrated on another device: bench was another, is sim",
+            marks=pytest.mark.nightly,
+        ),
     ],
 )
 def test_enrollment_reports_expired_results_and_results_of_other_devices(rig, tmp_path, days, device, words):

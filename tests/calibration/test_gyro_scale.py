@@ -213,6 +213,7 @@ def test_silent_servo_ends_the_calibration(simulated):
         s.bench.close()  # says that the torque could not be taken off
 
 
+@pytest.mark.nightly
 def test_scale_in_force_does_not_change_the_result(simulated):
     plain = run(simulated(seed=6)).estimates["scale"]
     scaled = run(simulated("imu.scale=1.05", "imu.scale_uncertainty=0.0", seed=6)).estimates["scale"]

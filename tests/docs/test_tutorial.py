@@ -12,7 +12,8 @@ from tests.docs.pages import DOCS
 EXIT_CODES = {"identify --set bench.sim.object=camera": 8, "goto 90": 5}
 
 
-@pytest.mark.parametrize("whole_frames", [False, pytest.param(True, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("whole_frames", [False, True])
 def test_commands_of_the_tutorial_end_as_it_says(tmp_path, monkeypatch, whole_frames):
     page = (DOCS / "tutorial/first-search.md").read_text(encoding="utf-8")
     (toml,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)

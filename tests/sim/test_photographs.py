@@ -140,6 +140,7 @@ def test_objects_are_found_by_the_photographs_that_were_not_enrolled(rig: Rig) -
     assert all(nearest_angle("obj10", frame, 22.5) % 45 == 22.5 for frame in frames)
 
 
+@pytest.mark.nightly
 def test_watch_shows_one_object_after_the_other(rig: Rig) -> None:
     save(Path("photographs"))
     for name in ("obj1", "obj2"):

@@ -191,7 +191,10 @@ def test_common_options_can_precede_or_follow_the_command(rig):
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.nightly)],
+    [
+        (signal.SIGTERM, 143),
+        *(pytest.param(*one, marks=pytest.mark.nightly) for one in ((signal.SIGINT, 130), (signal.SIGHUP, 129))),
+    ],
 )
 def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(rig, number, code):
     options = ["--views", "6", "--note", "the owner's", "--yes", "--json"]

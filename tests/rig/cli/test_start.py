@@ -51,9 +51,9 @@ def interrupted(
     ("moment", "words"),
     [
         ("rig.cli.main", "--version"),
-        ("rig.core.signals", "goto 90 --bench sim"),
         ("rig.bench", "goto 90 --bench sim"),  # the command has begun
-        ("cv2", "goto 90 --bench sim"),
+        pytest.param("rig.core.signals", "goto 90 --bench sim", marks=pytest.mark.nightly),
+        pytest.param("cv2", "goto 90 --bench sim", marks=pytest.mark.nightly),
         pytest.param("typer", "--version", marks=pytest.mark.nightly),
         pytest.param("rig.cli.objects.runs", "goto 90 --bench sim", marks=pytest.mark.nightly),
         pytest.param("numpy", "goto 90 --bench sim", marks=pytest.mark.nightly),
@@ -80,6 +80,7 @@ def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, w
     assert done.stdout
 
 
+@pytest.mark.nightly
 def test_ignored_ctrl_c_stays_ignored_until_a_command_begins(tmp_path):
     done = interrupted(tmp_path, "typer", "config", "show", handler=signal.SIG_IGN)
     assert (done.returncode, done.stderr) == (0, "")
@@ -132,7 +133,9 @@ threading.Thread.start = start
         pytest.param(PLAIN, "closed\n", "", id="command-of-a-package"),
         pytest.param(SET_NAME, "", "Interrupted.\n", id="python-3.11-makes-another-exception-of-it"),
         pytest.param(DEL, "", "Interrupted.\n", id="python-drops-the-exception"),
-        pytest.param(SLOW, "", "Interrupted.\n", id="python-drops-the-exception-on-a-busy-computer"),
+        pytest.param(
+            SLOW, "", "Interrupted.\n", id="python-drops-the-exception-on-a-busy-computer", marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_ctrl_c_unwinds_each_command(command, output, errors):

@@ -48,7 +48,7 @@ def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, cat
     ("start_deg", "step_deg", "rotates_to"),
     [
         (390.0, -90, [120.0]),
-        (30.0, 90, []),
+        pytest.param(30.0, 90, [], marks=pytest.mark.nightly),
         pytest.param(-395.0, 90, [-125.0], marks=pytest.mark.nightly),
         pytest.param(250.0, 5, [-115.0], marks=pytest.mark.nightly),
     ],

@@ -181,9 +181,8 @@ UNRELIABLE = ("camera.slow:fps=10", "camera.intermittent")
 LONG = ("camera.stuck", "camera.delayed", "camera.off", *MISSING, *MISTIMED, *UNRELIABLE)
 
 
-@pytest.mark.parametrize(
-    "kinds", [MISTIMED, *(pytest.param(one, marks=pytest.mark.nightly) for one in (MISSING, UNRELIABLE))]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("kinds", [MISTIMED, MISSING, UNRELIABLE])
 def test_faulty_frames_leave_only_true_views(tmp_path: Path, kinds: tuple[str, ...]) -> None:
     check_true_views(tmp_path, *(f"{kind}@{1.5 + 1.1 * i:.1f}s+0.8s" for i, kind in enumerate(kinds)))
 

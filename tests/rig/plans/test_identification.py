@@ -20,7 +20,7 @@ from sim.objects.shelf import shelf
 from sim.world import World
 from tests.small import SMALL
 
-VIEWS = 8
+VIEWS = 6
 
 
 @pytest.fixture(scope="module")

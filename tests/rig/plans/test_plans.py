@@ -199,7 +199,7 @@ def i2c_of(s):
     return s.operator.devices.i2c
 
 
-@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize("moving", [True, pytest.param(False, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("fail", "error"),
     [

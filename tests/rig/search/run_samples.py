@@ -30,7 +30,7 @@ def saved_runs(home: Path, strategies: Sequence[str] = ("ahbr", "hbr", "sweep", 
     ):
         list(photograph_table(bench))
         for name in ("mug-white", "mug-star", "lamp"):
-            list(enroll(bench, catalog, name, views=6))
+            list(enroll(bench, catalog, name, views=4))
         index = model_of(derived.views(catalog))
         for number, strategy in enumerate(strategies):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number

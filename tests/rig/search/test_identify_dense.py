@@ -64,6 +64,7 @@ def test_objects_enrolled_without_an_empty_table_image_are_searched_without_one(
     assert all(e.segmentation["agreement"] is None for e in events if isinstance(e, Accepted))
 
 
+@pytest.mark.nightly
 def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_path):
     s = simulated()
     list(photograph_table(s.bench))

@@ -80,7 +80,7 @@ def process(*words: str, cwd: Path) -> subprocess.Popen[str]:
 
 @pytest.mark.nightly
 @pytest.mark.realtime
-@pytest.mark.parametrize("in_depth", [False, pytest.param(True, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("in_depth", [False, True])
 def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
     first, *rest = commands()
     assert {typed.section for typed in rest} > set(IN_DEPTH)

@@ -190,6 +190,7 @@ def test_interrupted_import_leaves_images_only(tmp_path: Path) -> None:
         assert finished(verify(catalog)).findings == ()
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not COIL.is_dir(), reason="no COIL-100 at ../shared/data nor where RIG_TEST_DATA points")
 def test_coil_100_is_read() -> None:
     batch = read_folder(COIL, now=datetime(2026, 1, 1, tzinfo=UTC))
