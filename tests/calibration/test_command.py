@@ -84,6 +84,7 @@ def test_rejected_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, im
     assert json.loads(rig("goto", "90", "--json").stdout)["bound_deg"] < 1.5
 
 
+@pytest.mark.nightly
 def test_servo_results_replace_earlier_ones(rig, tmp_path, monkeypatch, servo_calibration):
     copytree(servo_calibration[0], tmp_path / "calibrations")
     names = [result.name for result in results_in(tmp_path / "calibrations")]

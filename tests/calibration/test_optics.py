@@ -97,6 +97,7 @@ def test_objects_cut_off_by_the_frame_are_rejected():
     assert not result.settings
 
 
+@pytest.mark.nightly
 def test_wrong_board_size_is_found_by_the_measured_distance():
     views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
 

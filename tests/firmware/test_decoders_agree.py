@@ -79,6 +79,7 @@ def runtime(name: str) -> str:
     return str(path) if path.is_absolute() else ""
 
 
+@pytest.mark.nightly
 def test_both_decoders_accept_the_same_frames(compiler):
     nightly = settings.get_current_profile_name() == "nightly"
     asan = runtime("libasan.so")

@@ -101,6 +101,7 @@ def test_table_angles_in_the_names_run_the_other_way(rig: Rig) -> None:
     assert all(apart(azimuth_deg, -nearest_angle("obj1", image, 45)) < 1 for azimuth_deg, image in stored_views("obj1"))
 
 
+@pytest.mark.nightly
 def test_fault_replaces_the_object_by_another_one_of_the_photographs(rig: Rig) -> None:
     save(Path("photographs"))
     rig("enroll", "obj1", "--yes", *WITHOUT_NOISE, *put(faults='["object_moved:other=3:angle=0@move3"]'))

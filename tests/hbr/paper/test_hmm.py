@@ -138,7 +138,9 @@ def risk_by_enumeration(belief, rotation_deg, temperature):
     return total
 
 
-@pytest.mark.parametrize(("counts", "temperature"), [((4, 5), 0.3), ((7, 6, 8), 0.1), ((3,), 0.1)])
+@pytest.mark.parametrize(
+    ("counts", "temperature"), [((4, 5), 0.3), pytest.param((7, 6, 8), 0.1, marks=pytest.mark.nightly), ((3,), 0.1)]
+)
 def test_risk_is_the_expected_probability_of_all_wrong_objects(counts, temperature):
     views, rng = shelf(*counts), np.random.default_rng(5)
     similar = 0.1 * rng.random((2, len(views)))

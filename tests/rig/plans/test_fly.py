@@ -232,6 +232,7 @@ def test_interrupted_revolution_is_resumed_and_can_be_paused(tmp_path: Path) -> 
         assert len(catalog.object("block").views) == 8
 
 
+@pytest.mark.nightly
 def test_enrollment_in_motion_is_abandoned_if_the_object_moved(tmp_path: Path) -> None:
     with (
         flying(tmp_path, *FAST, camera_readout_ms=0.0, faults=("object_falls@2.5s",)) as (bench, catalog, _),

@@ -20,7 +20,7 @@ from sim.objects.shelf import shelf
 from sim.world import World
 from tests.small import SMALL
 
-VIEWS = 6
+VIEWS = 8
 
 
 @pytest.fixture(scope="module")

@@ -128,6 +128,7 @@ def test_enrollment_is_not_continued_with_other_settings_of_the_camera(simulated
     assert isinstance(next(enroll(simulated().bench, catalog, "dice", resume=True)), Started)
 
 
+@pytest.mark.nightly
 def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):
     s = simulated()
     stored = 0

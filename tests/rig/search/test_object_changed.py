@@ -96,6 +96,7 @@ def test_result_has_the_image_and_the_views_of_the_new_object(model: Model, tmp_
         assert list(result.azimuths_deg) == [event.azimuth_deg for event in new]
 
 
+@pytest.mark.nightly
 def test_watch_continues_with_the_next_object_after_a_change(model: Model) -> None:
     with opened(REPLACED) as bench:
         events, answers = [], []

@@ -180,6 +180,7 @@ def test_catalog_is_evaluated_if_no_folder_is_named(tmp_path: Path, monkeypatch:
     assert results(Path("out"))["methods"][0]["curve"][0]["hit_rate"] > 0.5
 
 
+@pytest.mark.nightly
 def test_other_descriptors_are_evaluated_with_the_dense_filter(photographs: Path, tmp_path: Path) -> None:
     keys = 'descriptor = "edges+colours+cedd"\nperturbations = "shift:1+gain:1"\nmethods = "dense,dense-90"\n'
     done = run(photographs, keys + "enrolled = 6\ntrials = 1\nmax_views = 2\n", "--out", tmp_path)
