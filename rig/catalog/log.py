@@ -8,6 +8,7 @@ import pwd
 import re
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import datetime
 from typing import Any, Final, NamedTuple
@@ -33,8 +34,19 @@ _ENDS: Final = (
     select(func.max(Entry.id)),
     *(select(func.count()).where(column.is_not(None)) for column in _COUNTED),
 )
-OPERATOR: Final[ContextVar[str | None]] = ContextVar("operator", default=None)
-"""Who asks for the changes, if it is not the account that makes them: the person at a page of a server."""
+_OPERATOR: Final[ContextVar[str | None]] = ContextVar("operator", default=None)
+
+
+@contextmanager
+def asked_by(operator: str | None) -> Iterator[None]:
+    """Let the log name who asks for the changes of this thread: a person at a page; None is the account itself."""
+    before = _OPERATOR.set(operator)
+    try:
+        yield
+    finally:
+        _OPERATOR.reset(before)
+
+
 _COLUMNS: Final = tuple(column.name for column in Entry.__table__.columns)
 
 
@@ -42,7 +54,7 @@ def append(
     transaction: Transaction, clock: Clock, action: Action, object_name: str | None = None, **columns: Any
 ) -> Entry:
     """Add a line to the log, with these other columns of `Entry`, and return it."""
-    operator = {"operator": OPERATOR.get()} if OPERATOR.get() else {}
+    operator = {"operator": name} if (name := _OPERATOR.get()) else {}
     details = as_json({**operator, **columns.pop("details", {})}, "The details of the log entry")
     entry = Entry(
         id=0, time_utc=clock.utc(), **author(), action=action, object_name=object_name, details=details, **columns

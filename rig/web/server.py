@@ -5,8 +5,9 @@ import hashlib
 import json
 import secrets
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, TypeVar
 
@@ -17,7 +18,7 @@ from starlette.requests import HTTPConnection
 from rig.catalog import Catalog
 from rig.catalog.copying import Attempts, open_or_copy
 from rig.catalog.journal import BackgroundDelivery, JournalState
-from rig.catalog.log import OPERATOR
+from rig.catalog.log import asked_by
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
@@ -51,13 +52,17 @@ class BenchCatalog:
         self._become(local_copy_utc=None if copied is None else f"{copied:%Y-%m-%d %H:%M:%S} UTC")
         return catalog
 
-    def open_to_change(self, person: Person) -> Catalog:
+    @contextmanager
+    def open_to_change(self, person: Person) -> Iterator[Catalog]:
         """Open the catalog to change its objects; a `CatalogUnavailable` if its server does not answer.
 
-        The log names the person, in the thread of this request.
+        The log names the person.
         """
-        OPERATOR.set(None if person.name == LOCAL else person.name)
-        return Catalog.open(self._place, clock=self._clock)
+        with (
+            asked_by(None if person.name == LOCAL else person.name),
+            Catalog.open(self._place, clock=self._clock) as catalog,
+        ):
+            yield catalog
 
     def background_delivery(self) -> BackgroundDelivery:
         """Return a delivery of the journal during the work of a ``with`` block; notes on stderr say what it did."""

@@ -13,7 +13,7 @@ from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
 from rig.catalog.copying import open_or_copy
-from rig.catalog.log import OPERATOR
+from rig.catalog.log import asked_by
 from rig.charts.candidates import Styles, candidates_chart
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError, UsageError
@@ -209,9 +209,9 @@ class ServedDesk(Desk):
 def run_job(worker: BenchWorker, job: Job) -> None:
     """Run a job to its end; an operator who cancels closes it, and so the torque goes off."""
     desk, request = ServedDesk(worker, job), job.request
-    OPERATOR.set(None if job.operator == LOCAL else job.operator)
     parameters = {name: value for name, value in request if name != "kind"}
-    with closing(JOBS[type(request)](desk, **parameters)) as steps:
+    operator = None if job.operator == LOCAL else job.operator
+    with asked_by(operator), closing(JOBS[type(request)](desk, **parameters)) as steps:
         for step in steps:
             desk.show_step(step)
 
