@@ -13,19 +13,25 @@ from rig.core.json_form import plain
 
 LIMIT_S: Final = 30.0
 """A command that takes longer is killed: it may wait for a network that is gone."""
+_last: list[threading.Thread] = []
+"""The thread of the last command."""
 
 
 def notify(command: Sequence[str], message: Mapping[str, Any]) -> None:
     """Run a command with a message as JSON on its stdin, beside the bench: this returns at once.
 
-    The program ends when the command has ended, or after `LIMIT_S`. If the command fails, a warning is printed.
+    Commands run one after the other, in the order of the calls. The program ends when the last one has ended, each after
+    `LIMIT_S` at most. If a command fails, a warning is printed.
     """
     if command:
         content = json.dumps(plain(message), ensure_ascii=False, default=str) + "\n"
-        threading.Thread(target=_run, args=(list(command), content), name="notify").start()
+        _last[:] = [threading.Thread(target=_run, args=(list(command), content, *_last), name="notify")]
+        _last[0].start()
 
 
-def _run(command: list[str], content: str) -> None:
+def _run(command: list[str], content: str, before: threading.Thread | None = None) -> None:
+    if before is not None:
+        before.join()
     try:
         # In a session of its own, so that Ctrl+C at the terminal does not end it.
         ended = subprocess.run(
