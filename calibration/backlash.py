@@ -70,6 +70,7 @@ class Backlash(Procedure):
     """A procedure that measures the backlash by ``reversals`` of the table around its present angle."""
 
     names, title, devices, valid_days, plots = (NAME,), "backlash of the gears", ("servo", "imu"), 90, (plot,)
+    reference = "encoder of the servo"
     reversals: int
 
     def __post_init__(self) -> None:
@@ -107,13 +108,14 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     gyro = np.array([leg.gyro_deg for leg in used])
     # Encoder = ratio · gyro + backlash · direction: one linear fit to short and long legs.
     fitted = fit(used, np.column_stack([gyro, np.sign(encoder)]), resolution_deg)
-    (ratio, backlash), (ratio_sigma, backlash_sigma), worst = fitted.values, fitted.sigma, fitted.worst
+    (ratio, backlash), worst = fitted.values, fitted.worst
     found.residual = abs(float(fitted.residuals_deg[worst]))
     found.limit = COVERAGE * float(fitted.residual_sigma_deg[worst])
-    found.estimate("backlash", backlash, backlash_sigma, "°")
-    found.estimate("ratio", ratio, ratio_sigma, "° of the encoder per ° read")
+    backlash_sigma = found.estimate("backlash", backlash, "°", *fitted.budget(1, "°")).uncertainty
+    unit = "° of the encoder per ° read"
+    found.estimate("ratio", ratio, unit, *fitted.budget(0, unit))
     # The rotation by which encoder and platter may differ without a fault: the backlash and its uncertainty.
-    margin_deg = max(float(backlash), 0.0) + COVERAGE * float(backlash_sigma)
+    margin_deg = max(float(backlash), 0.0) + COVERAGE * backlash_sigma
     found.proposed = {"table.backlash_deg": round(margin_deg, 3)}
 
     # The gear first, then single legs, then what the backlash itself must keep.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 
 NAME = "servo.cable"
 
@@ -22,6 +22,7 @@ class Cable(Procedure):
     """A procedure in which the operator shows both ends of the cable. The servo moves nothing."""
 
     names, title, devices, valid_days = (NAME,), "ends of the cable", ("servo",), 365
+    reference = "the operator's hand; encoder of the servo"
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         bench.servo.torque_off()
@@ -36,8 +37,9 @@ class Cable(Procedure):
 def evaluate(high_deg: float, low_deg: float, *, pan: bool) -> Evaluation:
     """Evaluate the two ends of the cable, table angles in degrees; a ``pan`` table needs no whole revolution."""
     found = Evaluation(name=NAME, residual_unit="°", evidence={"margin_deg": MARGIN_DEG})
-    found.estimate("lowest", low_deg, HAND_DEG, "°")
-    found.estimate("highest", high_deg, HAND_DEG, "°")
+    taut = Contribution("angle at which an operator finds the cable taut", "B", HAND_DEG, "°")
+    found.estimate("lowest", low_deg, "°", taut)
+    found.estimate("highest", high_deg, "°", taut)
     low, high = limits = [round(low_deg + MARGIN_DEG, 1), round(high_deg - MARGIN_DEG, 1)]
     found.proposed = {"table.limits_deg": limits}
     if high_deg < low_deg:

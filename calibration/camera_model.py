@@ -25,7 +25,7 @@ from calibration.board_views import (
 )
 from calibration.procedure import Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 from rig.charts.xy import Axis, Chart, Series
 from rig.core.phrases import percent
 from rig.views.charuco_board import CharucoBoard
@@ -102,6 +102,7 @@ class CameraModel(Procedure):
     """A procedure that takes views of the board in four positions, from nine sides each."""
 
     names, title, devices, valid_days = (NAME,), "lens of the camera", ("camera",), 365
+    reference = "ChArUco board, {board.columns} × {board.rows} squares of {board.square_mm:g} mm"
     plots = (plot, plot_residuals, partial(plot_views, limit_px=MAX_RMS_PX))
     board: CharucoBoard = field(default_factory=CharucoBoard)
 
@@ -155,7 +156,7 @@ def evaluate(
     found.evidence["view_rms_px"] = view_rms.round(3).tolist()
     parameters = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(distortion)[:4]]
     for (name, unit), value, sigma in zip(PARAMETERS, parameters, np.ravel(deviations)[:8], strict=True):
-        found.estimate(name, value, sigma, unit)
+        found.estimate(name, value, unit, Contribution("scatter of the corners about the fit", "A", float(sigma), unit))
     # Check the fit: a loose board, residuals, coverage, and the uncertainty of the focal length.
     poses = [
         (np.asarray(r, dtype=np.float64), np.asarray(t, dtype=np.float64))

@@ -18,7 +18,7 @@ have more weight. The scatter of fast frames beyond that of slow ones is the jit
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import hypot, sqrt
+from math import sqrt
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from calibration.procedure import Ask, Evaluation, Measured, Procedure, lower_end, returning
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
 from rig.core.phrases import filled
 from rig.devices.camera import Frame
@@ -134,13 +134,15 @@ def bands_of(passes: Sequence[Pass]) -> list[tuple[slice, float]]:
 class Fit:
     """Times of the middle row and of each band.
 
+    ``middle_sigma_s`` and ``readout_sigma_s`` (2,) are the contributions to their standard uncertainties: of the
+    scatter of the frames, and of what is only known before.
     ``ahead_deg`` (n,) is the angle that the middle row of each frame shows, minus the angle at the frame's stamp.
     """
 
     middle_s: float
-    middle_sigma_s: float
+    middle_sigma_s: NDArray[np.float64]
     readout_s: float
-    readout_sigma_s: float
+    readout_sigma_s: NDArray[np.float64]
     jitter_s: float
     jitter_sigma_s: float
     scatter_deg: float
@@ -202,7 +204,8 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
     number = frame.astype(int)
     scores = np.zeros((number.max() + 1, design.shape[1]))
     np.add.at(scores, number, design * (residual * np.square(weight))[:, None])
-    covariance = inverse @ (scores.T @ scores + np.diag(np.square(known))) @ inverse
+    sources = scores.T @ scores, np.diag(np.square(known))
+    variances = np.array([np.diag(inverse @ source @ inverse)[:2] for source in sources])
     # The time of each band shows whether the times of the rows lie on a line.
     slopes, sigmas = [], []
     for of in own.T:
@@ -211,7 +214,7 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
         part = np.bincount(number[of], x[of] * residual[of] * np.square(weight[of]))
         sigmas.append(sqrt(max(float(np.square(part).sum()), 1e-12)) / max(power, 1e-12))
     birge = max(1.0, float(np.square(np.divide(slopes, sigmas)).sum()) / max(len(bands) - 2, 1))
-    middle_sigma_s, readout_sigma_s = np.sqrt(birge * np.diag(covariance)[:2]).tolist()
+    middle_sigma_s, readout_sigma_s = np.sqrt(birge * variances).T
     # The mean over all comparisons of a frame.
     precise = np.square(weight)
     total = np.bincount(number, precise)
@@ -261,6 +264,7 @@ class CameraTime(Procedure):
     """A procedure that measures the camera's time by rotating an object at several speeds in both directions."""
 
     names, title, devices, plots = (NAME,), "time of the frames", ("servo", "camera", "exposure"), (plot,)
+    reference = "encoder of the servo; clock of the computer"
     valid_days = 90
     """Three months, because time stamps depend on camera, driver, USB port and kernel."""
     thing: str = BOARD
@@ -306,7 +310,10 @@ class CameraTime(Procedure):
         found.reject_if(worst_deg > SLIP_DEG, RejectionCode.PLATTER_SLIPPED, residual_deg=worst_deg)
         found.reject_if(share > MAX_LOST, RejectionCode.FRAMES_LOST, lost=share, limit=MAX_LOST)
         if found.estimates:
-            found.estimate("lost_frames", share, sqrt(max(share, 1 / (frames + 1)) / (frames + 1)), "")
+            sigma = sqrt(max(share, 1 / (frames + 1)) / (frames + 1))
+            found.estimate(
+                "lost_frames", share, "", Contribution("chance in the number of lost frames", "A", sigma, "")
+            )
         yield found
 
 
@@ -383,16 +390,25 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
         used = sum(len(one.angle_deg) for one in passes)
         return found.reject(RejectionCode.TOO_FEW_FRAMES, used=used, needed=FEWEST_FRAMES)
     middle_s, readout_s, scatter_deg = times.middle_s, times.readout_s, times.scatter_deg
-    jitter_s, jitter_sigma_s, readout_sigma_s = times.jitter_s, times.jitter_sigma_s, times.readout_sigma_s
-    # The scatter of the passes does not show errors that all of them share.
-    sigma_s = hypot(times.middle_sigma_s, COMMON_S)
+    jitter_s = times.jitter_s
     found.residual = scatter_deg
-    found.estimate("offset", middle_s * 1e3, sigma_s * 1e3, "ms")
-    found.estimate("jitter", jitter_s * 1e3, jitter_sigma_s * 1e3, "ms")
-    found.estimate("readout", readout_s * 1e3, readout_sigma_s * 1e3, "ms")
+
+    def budget(sigma_s: NDArray[np.float64]) -> tuple[Contribution, Contribution]:
+        scatter_s, known_s = sigma_s.tolist()
+        return (
+            Contribution("scatter of the frames", "A", scatter_s * 1e3, "ms"),
+            Contribution("backlash and read-out time, where frames do not show them", "B", known_s * 1e3, "ms"),
+        )
+
+    # The scatter of the passes does not show errors that all of them share.
+    common = Contribution("times of the encoder's readings, and trajectory", "B", COMMON_S * 1e3, "ms")
+    chance = Contribution("chance in the scatter of the frames", "A", times.jitter_sigma_s * 1e3, "ms")
+    offset = found.estimate("offset", middle_s * 1e3, "ms", *budget(times.middle_sigma_s), common)
+    found.estimate("jitter", jitter_s * 1e3, "ms", chance)
+    found.estimate("readout", readout_s * 1e3, "ms", *budget(times.readout_sigma_s))
     found.proposed = {
         "camera_time.offset_ms": round(middle_s * 1e3, 4),
-        "camera_time.uncertainty_ms": round(sigma_s * 1e3, 4),
+        "camera_time.uncertainty_ms": round(offset.uncertainty, 4),
         "camera_time.jitter_ms": round(jitter_s * 1e3, 4),
         "camera_time.readout_ms": round(max(readout_s, 0.0) * 1e3, 3),
     }
@@ -413,9 +429,9 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
         needed_deg=MAX_ANGLE_DEG,
     )
     found.reject_if(
-        sigma_s * 1e3 > MAX_UNCERTAINTY_MS,
+        offset.uncertainty > MAX_UNCERTAINTY_MS,
         RejectionCode.FRAME_TIME_UNCERTAIN,
-        uncertainty_ms=sigma_s * 1e3,
+        uncertainty_ms=offset.uncertainty,
         limit_ms=MAX_UNCERTAINTY_MS,
     )
     found.reject_if(

@@ -80,6 +80,7 @@ class Encoder(Procedure):
     """A procedure that measures the encoder's error over ``revolutions`` of the table, in even steps upwards."""
 
     names, title, devices, valid_days, plots = (NAME,), "error of the encoder", ("servo", "imu"), 365, (plot,)
+    reference = "whole revolutions of the platter, divided by the gyro"
     revolutions: int
 
     def __post_init__(self) -> None:
@@ -141,8 +142,8 @@ def evaluate(steps: Sequence[Step], *, direction: int, revolution_deg: float, re
     fitted = fit([s.leg for s in used], np.column_stack([gyro, direction * basis]), resolution_deg)
     found.residual = abs(float(fitted.residuals_deg[fitted.worst]))
     found.limit = COVERAGE * float(fitted.residual_sigma_deg[fitted.worst])
-    for name, value, sigma in zip(NAMES, fitted.values[1:], fitted.sigma[1:], strict=True):
-        found.estimate(name, value, sigma, "°")
+    for number, name in enumerate(NAMES, 1):  # the first parameter is the gyro's scale
+        found.estimate(name, fitted.values[number], "°", *fitted.budget(number, "°"))
     found.proposed = {"table.encoder_harmonics_deg": [round(float(value), 4) for value in fitted.values[1:]]}
 
     largest = float(np.abs(_basis(np.linspace(0.0, revolution_deg, 361), revolution_deg) @ fitted.values[1:]).max())
@@ -151,7 +152,7 @@ def evaluate(steps: Sequence[Step], *, direction: int, revolution_deg: float, re
         largest > MAX_ERROR_DEG, RejectionCode.ENCODER_ERROR_TOO_LARGE, error_deg=largest, limit_deg=MAX_ERROR_DEG
     )
     found.reject_if(
-        (uncertainty := float(fitted.sigma[1:].max())) > MAX_UNCERTAINTY_DEG,
+        (uncertainty := max(one.uncertainty for one in found.estimates.values())) > MAX_UNCERTAINTY_DEG,
         RejectionCode.ENCODER_UNCERTAIN,
         uncertainty_deg=uncertainty,
         limit_deg=MAX_UNCERTAINTY_DEG,

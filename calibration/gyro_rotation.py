@@ -30,7 +30,7 @@ from calibration.procedure import (
     returning,
 )
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
 from rig.core.json_form import plain
 from rig.motion.turntable import Turntable
@@ -82,6 +82,7 @@ class GyroRotation(Procedure):
     """A procedure that rotates back and forth ``repeats`` times at each speed, around the table's present angle."""
 
     names, title, devices, valid_days, plots = (NAME,), "scatter of rotations", ("servo", "imu"), 180, (plot,)
+    reference = "encoder of the servo"
     repeats: int
 
     def __post_init__(self) -> None:
@@ -134,8 +135,9 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
         stated_deg = float(np.sqrt((sigma**2).mean()))
         row = {"speed": speed, "seconds": seconds, "measured_deg": measured_deg, "stated_deg": stated_deg}
         rows.append({**row, "freedom": freedom, "ratio_may_be": [low, high]})
-        found.estimate(f"sigma_{speed}", measured_deg, measured_deg / sqrt(2 * freedom), "°")
-        found.estimate(f"ratio_{speed}", ratio, ratio / sqrt(2 * freedom), "of the stated σ")
+        for name, value, unit in (("sigma", measured_deg, "°"), ("ratio", ratio, found.residual_unit)):
+            chance = Contribution("chance in the scatter of so few moves", "A", value / sqrt(2 * freedom), unit)
+            found.estimate(f"{name}_{speed}", value, unit, chance)
         code = RejectionCode.SCATTER_TOO_LARGE if ratio > 1 else RejectionCode.SCATTER_TOO_SMALL
         found.reject_if(not low < ratio < high, code, **row, ratio=ratio)
     found.evidence = {"by_duration": rows, "moves": plain(list(moves))}

@@ -70,6 +70,7 @@ class GyroScale(Procedure):
     """A procedure that measures the gyro's scale by at least ``revolutions`` whole revolutions."""
 
     names, title, devices, plots = (NAME,), "scale of the gyro", ("servo", "imu"), (plot,)
+    reference = "whole revolutions of the servo's encoder"
     valid_days = 180
     """Half a year, to notice a loose sensor; the scale changes by mounting and temperature, not by use."""
     revolutions: int
@@ -121,11 +122,11 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     if not PLAUSIBLE[0] < (ratio := float(np.median(gyro / encoder))) < PLAUSIBLE[1]:
         return found.reject(RejectionCode.GYRO_IMPLAUSIBLE, ratio=ratio)
     fitted = fit(used, gyro[:, None], resolution_deg)
-    value, uncertainty = float(fitted.values[0]), float(fitted.sigma[0])
+    value, unit = float(fitted.values[0]), "true °/s per °/s read"
+    uncertainty = found.estimate("scale", value, unit, *fitted.budget(0, unit)).uncertainty
     residuals = np.abs(encoder - value * gyro)
     worst = int(np.argmax(residuals / sigma))
     found.residual, found.limit = float(residuals[worst]), COVERAGE * float(sigma[worst])
-    found.estimate("scale", value, uncertainty, "true °/s per °/s read")
     found.proposed = {NAME: value, f"{NAME}_uncertainty": uncertainty}
     (value_up, sigma_up), (value_down, sigma_down) = (_ratio(encoder[way], gyro[way], sigma[way]) for way in (up, ~up))
     found.evidence |= {"scale_up": value_up, "scale_down": value_down}

@@ -18,7 +18,7 @@ from calibration.camera_model import matrix_of
 from calibration.procedure import Evaluation, Measured, Procedure
 from calibration.table_axis import first_axis, pose
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 from rig.config import MarkConfig
 from rig.views.charuco_board import BoardDetection, CharucoBoard, mark_angle_deg
 
@@ -35,6 +35,7 @@ class HomeMark(Procedure):
     """A procedure that takes views of the card from eleven sides. Needs the camera's calibration."""
 
     names, title, devices, valid_days = (NAME,), "home mark", ("camera", "servo"), 365
+    reference = "encoder of the servo; ChArUco card, {card.columns} × {card.rows} squares of {card.square_mm:g} mm"
     requires = (camera_model.NAME,)
     card: CharucoBoard
 
@@ -69,7 +70,8 @@ def evaluate(
     angles = [mark_angle_deg(BoardDetection(view.ids, view.corners_px, nothing), mark) for view in views]
     errors = [180.0 if seen is None else seen - view.table_deg for seen, view in zip(angles, views, strict=True)]
     found.residual = residual = max(map(abs, errors))
-    found.estimate("angle", np.mean(errors), np.std(errors), "°")
+    scatter = Contribution("scatter of single views", "A", float(np.std(errors)), "°")
+    found.estimate("angle", np.mean(errors), "°", scatter)
     found.evidence = {"views": len(views), "errors_deg": np.round(errors, 2).tolist()}
     found.proposed = {f"mark.{key}": list(value) for key, value in mark.model_dump().items()}
     found.reject_if(residual > MAX_RESIDUAL_DEG, RejectionCode.BOARD_LOOSE, difference_deg=residual)

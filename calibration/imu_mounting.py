@@ -9,8 +9,8 @@ delay.
 
 from collections.abc import Generator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field
-from math import degrees, hypot, sqrt
+from dataclasses import dataclass, field, replace
+from math import degrees, hypot, radians, sqrt
 from typing import Any, cast
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.procedure import Evaluation, Measured, Procedure, returning, too_little_room
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, Estimate, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.devices.imu import Imu, ImuSamples
 from rig.devices.servo import Servo, ServoState
@@ -137,6 +137,7 @@ class ImuMounting(Procedure):
     """A procedure that rotates the table once, in eight steps, and reads the sensor at each stop."""
 
     names, title, devices, valid_days, plots = (NAME,), "mounting of the IMU", ("servo", "imu"), 180, (plot,)
+    reference = "gravity, and the axis about which the table rotates; of the delay, encoder of the servo"
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         config = bench.config
@@ -185,11 +186,13 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
     total = np.sum([move.rotation_deg for move in moves], axis=0)
     length = float(np.linalg.norm(total))
     axis = total / length  # of a counter-clockwise rotation: upwards
-    sigma = sqrt(sum(move.sigma_deg**2 for move in moves)) / length
-    others = [i for i in range(3) if i != column]
-    tilt_sigma = {i: hypot(sigma, AXIS_GAIN_SIGMA * float(axis[i])) for i in others}
-    for i in others:
-        found.estimate(f"tilt_{'xyz'[i]}", degrees(float(axis[i])), degrees(tilt_sigma[i]), "°")
+    noise_deg = sqrt(sum(move.sigma_deg**2 for move in moves))
+    noise = Contribution("noise and zero of the gyro, summed over the moves", "A", noise_deg, "°", degrees(1 / length))
+    tilts = {}
+    for i in (i for i in range(3) if i != column):
+        tilt_deg = degrees(float(axis[i]))
+        gain = Contribution("difference of the scales of two axes of the gyro", "B", AXIS_GAIN_SIGMA, "1", tilt_deg)
+        tilts[i] = found.estimate(f"tilt_{'xyz'[i]}", tilt_deg, "°", noise, gain)
     tilt_deg = degrees(float(np.arccos(np.clip(sign * axis[column], -1.0, 1.0))))
     found.residual, found.limit = tilt_deg, MAX_TILT_DEG
     if tilt_deg > MAX_TILT_DEG:
@@ -198,7 +201,7 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
         right_sign = 1 if axis[nearest] > 0 else -1
         found.reject_if(wrong, RejectionCode.WRONG_AXIS, axis="xyz"[nearest], sign=right_sign)
         found.reject_if(not wrong, RejectionCode.TILT_TOO_LARGE, tilt_deg=tilt_deg, limit_deg=MAX_TILT_DEG)
-    found.estimates |= _levels(levels, axis, column, tilt_sigma)
+    found.estimates |= _levels(levels, axis, column, tilts)
     found.estimates["delay"] = _delay(moves)
     level_deg = hypot(found.estimates["axis_x"].value, found.estimates["axis_y"].value)
     found.reject_if(level_deg > MAX_LEVEL_DEG, RejectionCode.NOT_LEVEL, level_deg=level_deg, limit_deg=MAX_LEVEL_DEG)
@@ -206,25 +209,30 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
 
 
 def _levels(
-    levels: Sequence[GravityReading], axis: NDArray[np.float64], column: int, tilt_sigma: Mapping[int, float]
+    levels: Sequence[GravityReading], axis: NDArray[np.float64], column: int, tilts: Mapping[int, Estimate]
 ) -> dict[str, Estimate]:
-    """Return the accelerometer's zero errors (g), and the deviation of the table's axis from the vertical (°)."""
+    """Return the accelerometer's zero errors (g), and the deviation of the table's axis from the vertical (°).
+
+    ``tilts`` are those of the sensor, by column.
+    """
     angle = np.radians([level.table_deg for level in levels])
     readings = np.array([level.mean_g for level in levels])
     design = np.column_stack([np.ones(angle.size), np.cos(angle), np.sin(angle)])
     (mean, cosine, sine), *_ = np.linalg.lstsq(design, readings, rcond=None)
-    noise = sqrt(sum(level.sigma_g**2 for level in levels)) / len(levels)
+    noise_g = sqrt(sum(level.sigma_g**2 for level in levels)) / len(levels)
+    noise = Contribution("noise of the accelerometer, averaged over the rests", "A", noise_g, "g")
     estimates = {}
     for i, name in enumerate("xyz"):
-        sigma = hypot(noise, tilt_sigma.get(i, 0.0))
-        estimates[f"accel_zero_{name}"] = Estimate(float(mean[i] - axis[i]), sigma, "g")
+        # A tilt of 1 rad is seen as 1 g.
+        tilt = [replace(one, sensitivity=radians(one.sensitivity)) for one in tilts[i].budget] if i in tilts else ()
+        estimates[f"accel_zero_{name}"] = Estimate(float(mean[i] - axis[i]), (noise, *tilt), "g")
     # Gravity's horizontal part rotates in the platter's frame: two axes 90° apart show it.
     a, b = (column + 1) % 3, (column + 2) % 3
     if axis[column] < 0:
         a, b = b, a
-    sigma_deg = degrees(noise)
-    estimates["axis_x"] = Estimate(degrees(float(cosine[a] - sine[b]) / 2), sigma_deg, "° off the vertical")
-    estimates["axis_y"] = Estimate(degrees(float(sine[a] + cosine[b]) / 2), sigma_deg, "° off the vertical")
+    noise = replace(noise, sensitivity=degrees(1.0))
+    for name, slope in (("axis_x", cosine[a] - sine[b]), ("axis_y", sine[a] + cosine[b])):
+        estimates[name] = Estimate(degrees(float(slope) / 2), (noise,), "° off the vertical")
     return estimates
 
 
@@ -240,7 +248,12 @@ def _delay(moves: Sequence[RecordedMove]) -> Estimate:
     # Readings of one rotation share the encoder's error at its rest, so the rotations are the independent data. A
     # vibrating platter comes to rest a little inside the backlash, always on the same side.
     scatter = float(np.std(each, ddof=1)) / sqrt(len(each))
-    return Estimate(delay, hypot(scatter, REST_IN_BACKLASH_DEG / float(np.median(rate))), "s")
+    per_degree = 1 / float(np.median(rate))
+    budget = (
+        Contribution("scatter of the moves", "A", scatter, "s"),
+        Contribution("rest of the platter in the backlash", "B", REST_IN_BACKLASH_DEG, "°", per_degree),
+    )
+    return Estimate(delay, budget, "s")
 
 
 def _observe_rest(bench: Bench, table: Turntable) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.procedure import Evaluation
-from rig.calibrations import RejectionCode
+from rig.calibrations import Contribution, RejectionCode
 from rig.config import ImuConfig
 from rig.motion.move import Move
 
@@ -49,10 +49,19 @@ def reasons(legs: Sequence[Leg]) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class LinearFit:
-    """Parameters with their standard uncertainties, and the residuals (n,) with theirs, in degrees."""
+    """Parameters (p,), and the residuals (n,) with their standard uncertainties, in degrees.
+
+    ``scatter``, ``gyro`` and ``encoder`` (p,) are the contributions of the legs' scatter, of the gyro and of the
+    encoder's resolution to the standard uncertainties of the parameters. ``gyro_deg`` and ``encoder_deg`` are the
+    standard uncertainties of these sources, for a leg and for a rest.
+    """
 
     values: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    scatter: NDArray[np.float64]
+    gyro: NDArray[np.float64]
+    gyro_deg: float
+    encoder: NDArray[np.float64]
+    encoder_deg: float
     residuals_deg: NDArray[np.float64]
     residual_sigma_deg: NDArray[np.float64]
 
@@ -61,12 +70,27 @@ class LinearFit:
         """The index of the leg with the largest residual in units of its uncertainty."""
         return int(np.argmax(np.abs(self.residuals_deg) / self.residual_sigma_deg))
 
+    def budget(self, parameter: int, unit: str) -> list[Contribution]:
+        """Return the uncertainty budget of a parameter in ``unit``."""
+        found = [Contribution("scatter of the legs about the fit", "A", float(self.scatter[parameter]), unit)]
+        for source, part, sigma_deg in (
+            ("noise and zero of the gyro, as stated for a leg", self.gyro, self.gyro_deg),
+            ("resolution of the encoder at a rest", self.encoder, self.encoder_deg),
+        ):
+            if sigma_deg:
+                found.append(Contribution(source, "B", sigma_deg, "°", float(part[parameter]) / sigma_deg))
+        return found
+
 
 def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float) -> LinearFit:
     """Fit the encoder's rotations by a linear model, by generalised least squares.
 
     A rest lies anywhere within an encoder count. Consecutive legs share a rest with opposite signs, so their errors are
-    correlated. The uncertainties combine the stated noise with the scatter of the legs: see `scatter`.
+    correlated.
+
+    The stated noise of a bench may be too high or too low, and a few legs do not show which. Therefore the variance of
+    a parameter is a weighted mean: the stated noise has the weight of `STATED_WEIGHT` legs, the scatter that of its
+    degrees of freedom. It is the mean of an inverse-gamma posterior of the square of the Birge ratio about 1.
 
     Each leg begins at the rest where the previous one ended. ``design``, float64 (n, p), is each leg's rotation by the
     encoder per unit of each parameter. ``resolution_deg`` is the angle of one encoder count.
@@ -74,14 +98,29 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
     n, parameters = design.shape
     count = resolution_deg**2 / 12
     shared = np.diag(np.full(n, 2 * count)) - count * (np.eye(n, k=1) + np.eye(n, k=-1))
-    covariance = np.diag([leg.sigma_deg**2 for leg in legs]) + shared
+    gyro = np.diag([leg.sigma_deg**2 for leg in legs])
+    covariance = gyro + shared
     encoder = np.array([leg.encoder_deg for leg in legs])
     root = np.linalg.cholesky(covariance)
     white, white_encoder = np.linalg.solve(root, design), np.linalg.solve(root, encoder)
     values = np.linalg.lstsq(white, white_encoder, rcond=None)[0]
-    square = scatter(float(((white_encoder - white @ values) ** 2).sum()), n - parameters)
-    sigma = np.sqrt(np.diag(np.linalg.inv(white.T @ white)) * square)
-    return LinearFit(values, sigma, encoder - design @ values, np.sqrt(np.diag(covariance)))
+    chi_square, weight = float(((white_encoder - white @ values) ** 2).sum()), n - parameters + STATED_WEIGHT
+    spread = np.linalg.inv(white.T @ white)
+    gain = spread @ np.linalg.solve(root.T, white).T  # values = gain @ encoder
+
+    def stated(part: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.sqrt(np.diag(gain @ part @ gain.T) * STATED_WEIGHT / weight))
+
+    return LinearFit(
+        values,
+        scatter=np.sqrt(np.diag(spread) * chi_square / weight),
+        gyro=stated(gyro),
+        gyro_deg=sqrt(float(np.diag(gyro).mean())),
+        encoder=stated(shared),
+        encoder_deg=sqrt(count),
+        residuals_deg=encoder - design @ values,
+        residual_sigma_deg=np.sqrt(np.diag(covariance)),
+    )
 
 
 def reject_slipped_leg(found: Evaluation, number: int) -> None:
@@ -90,12 +129,3 @@ def reject_slipped_leg(found: Evaluation, number: int) -> None:
     assert found.limit is not None
     code, residual_deg, limit_deg = RejectionCode.LEG_SLIPPED, found.residual, found.limit
     found.reject_if(residual_deg > limit_deg, code, leg=number, residual_deg=residual_deg, limit_deg=limit_deg)
-
-
-def scatter(chi_square: float, freedom: int) -> float:
-    """Return the factor by which the variance of legs differs from the stated one: the square of the Birge ratio.
-
-    The stated noise of a bench may be too high or too low, and a few legs do not show which. Therefore the stated noise
-    has the weight of `STATED_WEIGHT` legs: the result is the mean of an inverse-gamma posterior about 1.
-    """
-    return (chi_square + STATED_WEIGHT) / (freedom + STATED_WEIGHT)

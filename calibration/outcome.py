@@ -30,11 +30,12 @@ def in_force(bench: "Bench", name: str) -> "CalibrationResult":
 
 
 def as_json(result: "CalibrationResult") -> dict[str, Any]:
-    """Return a result as JSON; each rejection also in words."""
+    """Return a result as JSON; each rejection also in words, and each estimate with its standard uncertainty."""
     from rig.core.json_form import plain
 
     rejections = [{"code": r.code.name.lower(), "values": plain(r.values), "text": str(r)} for r in result.rejections]
-    return {**plain(result), "rejections": rejections}
+    estimates = {name: {**plain(one), "uncertainty": one.uncertainty} for name, one in result.estimates.items()}
+    return {**plain(result), "estimates": estimates, "rejections": rejections}
 
 
 def outcome_text(result: "CalibrationResult") -> str:

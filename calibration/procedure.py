@@ -13,10 +13,19 @@ from typing import Any, ClassVar, Self
 
 from calibration.outcome import as_json, in_force, outcome_text
 from rig.bench import Bench, calibrate
-from rig.calibrations import CalibrationRejection, CalibrationResult, CalibrationStore, Estimate, RejectionCode
+from rig.calibrations import (
+    CalibrationRejection,
+    CalibrationResult,
+    CalibrationStore,
+    Contribution,
+    Estimate,
+    RejectionCode,
+)
 from rig.calibrations.rejection import rejection
+from rig.catalog import log
 from rig.charts.xy import Chart
 from rig.core.errors import LimitExceeded, UsageError
+from rig.core.phrases import filled
 from rig.events.events import Event
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Steps
 from rig.jobs.regions import warn_of_other_regions
@@ -67,11 +76,14 @@ class Evaluation:
         self.rejections.append(rejection(code, values))
         return self
 
-    def estimate(self, name: str, value: Any, uncertainty: Any, unit: str = "") -> None:
-        """Add an estimate."""
-        self.estimates[name] = Estimate(float(value), float(uncertainty), unit)
+    def estimate(self, name: str, value: Any, unit: str, *budget: Contribution) -> Estimate:
+        """Add an estimate with the contributions to its uncertainty, and return it."""
+        self.estimates[name] = found = Estimate(float(value), budget, unit)
+        return found
 
-    def result(self, *, when_utc: datetime, device: Any, valid_days: float | None = None) -> CalibrationResult:
+    def result(
+        self, *, when_utc: datetime, device: Any, reference: str, operator: str, valid_days: float | None = None
+    ) -> CalibrationResult:
         """Return the dated result for a device."""
         return CalibrationResult(
             name=self.name,
@@ -83,6 +95,8 @@ class Evaluation:
             settings=self.settings,
             valid_days=valid_days,
             when_utc=when_utc,
+            reference=reference,
+            operator=operator,
             device=device,
             evidence=self.evidence,
         )
@@ -100,6 +114,8 @@ class Procedure(ABC):
         The results that the procedure yields, in order.
     title
         The quantity that it calibrates, in words.
+    reference
+        What the quantity is compared with, in words: a template of the procedure's options.
     devices
         The devices that its results are bound to.
     valid_days
@@ -112,6 +128,7 @@ class Procedure(ABC):
 
     names: ClassVar[tuple[str, ...]]
     title: ClassVar[str]
+    reference: ClassVar[str]
     devices: ClassVar[tuple[str, ...]]
     valid_days: ClassVar[float]
     requires: ClassVar[tuple[str, ...]] = ()
@@ -130,12 +147,18 @@ class Procedure(ABC):
         self, bench: Bench, *required: CalibrationResult
     ) -> Generator[Event | Ask | Progress | CalibrationResult, None, None]:
         """Calibrate the bench: yield events, and each result when it is known. Raises what `measure` raises."""
-        when_utc = bench.clock.utc()
+        when_utc, reference = bench.clock.utc(), filled(self.reference, **vars(self))
         with closing(self.measure(bench, *required)) as events:
             for event in events:
                 if isinstance(event, Evaluation):
                     device = bench.apparatus(*self.devices)
-                    yield event.result(when_utc=when_utc, device=device, valid_days=self.valid_days)
+                    yield event.result(
+                        when_utc=when_utc,
+                        reference=reference,
+                        operator=log.operator(),
+                        device=device,
+                        valid_days=self.valid_days,
+                    )
                 else:
                     yield event
 

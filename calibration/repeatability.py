@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import hbr
 from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 from rig.charts.xy import LIMIT, OTHER, Axis, Chart, Series
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
@@ -74,6 +74,7 @@ class Repeatability(Procedure):
     """A procedure that asks for the object ``name`` at its mark several times, and takes views from all sides."""
 
     names, title, devices, valid_days, plots = (NAME,), "repeatability of views", ("camera",), 180, (plot,)
+    reference = "other views of {name}"
     name: str
     placements: int
     error_rate: float
@@ -184,7 +185,8 @@ def evaluate(
     drawn = np.array([figures(rng.integers(0, AZIMUTHS, AZIMUTHS)) for _ in range(BOOTSTRAPS)])
     names = ("repeat", "placed_again", "repeatability", "scatter")
     for name, value, sigma in zip(names, values, drawn.std(axis=0, ddof=1), strict=True):
-        found.estimate(name, value, sigma, "of similarity")
+        chance = Contribution("chance in the azimuths (bootstrap)", "A", float(sigma), "of similarity")
+        found.estimate(name, value, "of similarity", chance)
     margin = NormalDist().inv_cdf(1 - error_rate) * sqrt(2 / views) * values[3]
     found.residual = 1.0 - low
     found.proposed = {"identify.repeatability": round(values[2], 4), "identify.margin": round(min(margin, 1.0), 4)}

@@ -9,12 +9,12 @@ from markupsafe import Markup
 
 from calibration.outcome import plain_value, residual_words
 from calibration.procedures import PROCEDURES
-from rig.calibrations import BenchCalibration, CalibrationResult, CalibrationStatus
+from rig.calibrations import BenchCalibration, CalibrationResult, CalibrationStatus, Estimate
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do
-from rig.core.phrases import filled
+from rig.core.phrases import filled, in_unit, number, percent
 from rig.core.templates import environment
 
 PLOTS = {name: procedure.plots for procedure in PROCEDURES for name in procedure.names}
@@ -46,6 +46,8 @@ class _ShownResult(NamedTuple):
     devices: Sequence[tuple[str, str]]
     residual: str
     settings: Sequence[str]
+    budgets: Sequence[tuple[str, Estimate, Sequence[Sequence[str]]]]
+    """Name, estimate, and the rows of its uncertainty budget."""
 
 
 def plots(result: CalibrationResult) -> list[Chart]:
@@ -85,7 +87,9 @@ def write_page(
     page = template.render(
         title=f"Calibration of {bench}",
         date=f"{now_utc:%Y-%m-%d %H:%M} UTC",
-        summary="The errors of the bench itself. Uncertainties are standard uncertainties (1 σ).",
+        summary="The errors of the bench itself, with standard uncertainties (1 σ), expanded uncertainties "
+        "U (k = 2, about 95 %), and their budgets by JCGM 100:2008. A source of type A is the scatter of the "
+        "measurements, one of type B is known otherwise.",
         totals=[
             {"label": str(status), "value": n, "note": ""}
             for status, n in count.items()
@@ -114,7 +118,26 @@ def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) 
         [(part, _words(identity)) for part, identity in result.device.items() if part in ("servo", "imu", "camera")],
         residual_words(result),
         [f"{key} = {plain_value(value)}" for key, value in result.settings.items()],
+        [(name, estimate, _budget(estimate)) for name, estimate in result.estimates.items()],
     )
+
+
+def _budget(estimate: Estimate) -> list[tuple[str, ...]]:
+    """Return the rows of an uncertainty budget: source, type, u, sensitivity, contribution, and its share.
+
+    The contribution is in the unit of the quantity.
+    """
+    return [
+        (
+            one.source,
+            one.kind,
+            in_unit(f"{one.uncertainty:.2g}", one.unit),
+            number(one.sensitivity, ".2g"),
+            f"{one.part:.2g}",
+            percent(estimate.share(one), 0),
+        )
+        for one in estimate.budget
+    ]
 
 
 def _words(identity: Mapping[str, Any]) -> str:

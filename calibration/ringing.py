@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from calibration.procedure import Evaluation, Measured, Procedure, lower_end, require_at_least, returning
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.motion.move import motion_seconds
 from rig.motion.traces import MoveTrace
@@ -87,6 +87,7 @@ class Ringing(Procedure):
     """A procedure that stops the table ``stops`` times, and listens to the platter."""
 
     names, title, devices, valid_days, plots = (NAME,), "ringing of the platter", ("servo", "imu"), 180, (plot,)
+    reference = "clock of the computer, by the times of the gyro's samples"
     stops: int
 
     def __post_init__(self) -> None:
@@ -127,11 +128,10 @@ def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
         return found.reject(RejectionCode.NO_RINGING, peak_dps=peak_dps, noise_dps=noise_dps)
     without = np.array([_fit([*used[:i], *used[i + 1 :]], fitted) for i in range(len(used))])
     sigma = np.sqrt((len(used) - 1) * without.var(axis=0))
-    found.estimate("frequency", hz, sigma[0], "Hz")
-    found.estimate("damping", damping, sigma[1])
     lags = tail_dps > MIN_PEAK * noise_dps  # else its time is that of noise
-    if lags:
-        found.estimate("lag", lag_s, sigma[2], "s")
+    for index, (name, unit) in enumerate((("frequency", "Hz"), ("damping", ""), *((("lag", "s"),) if lags else ()))):
+        scatter = Contribution("scatter of the stops (jackknife)", "A", float(sigma[index]), unit)
+        found.estimate(name, fitted[index], unit, scatter)
     first = used[0]
     found.evidence["stop"] = {
         "time_s": first.time_s.round(4).tolist(),

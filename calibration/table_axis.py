@@ -13,7 +13,7 @@ camera.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from math import degrees, hypot, radians, sqrt
 from typing import Any
@@ -29,7 +29,7 @@ from calibration.board_views import BoardView, as_json, plot_views, points, reje
 from calibration.camera_model import PARAMETERS, matrix_of
 from calibration.procedure import Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate, RejectionCode
+from rig.calibrations import CalibrationResult, Contribution, Estimate, RejectionCode
 from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
 from rig.jobs.desk import Progress
 from rig.views.charuco_board import CharucoBoard
@@ -55,6 +55,8 @@ PIVOT_MM = 80.0
 """Typical distance of the bearing below the board's middle."""
 BIAS_PX = 0.02
 """Common error of OpenCV's corners; more corners do not reduce it."""
+SQUARE_SIGMA_MM = 0.03  # ±0.05 mm of a caliper, uniform
+"""Standard uncertainty of the side of a square, measured on the print. Images alone do not determine lengths."""
 FIRST_POSE = 15
 """Parameters before the poses of the board: direction, point and lean (two each), the pivot, and the camera."""
 
@@ -135,6 +137,7 @@ class TableAxis(Procedure):
     """
 
     names, title, devices, valid_days = (NAME,), "axis of the table", ("camera", "servo"), 365
+    reference = "encoder of the servo; ChArUco board, {board.columns} × {board.rows} squares of {board.square_mm:g} mm"
     requires, plots = (camera_model.NAME,), (plot, partial(plot_views, limit_px=MAX_RMS_PX))
     board: CharucoBoard = field(default_factory=CharucoBoard)
     space: ObjectSpace = field(default_factory=ObjectSpace)
@@ -222,7 +225,7 @@ class _Axis:
         self._known_sigma[1:3] *= sqrt(2)  # both focal lengths have the same error, so they count once
         self._points = [points(board, view) for view in views]
         self._corners_px = np.concatenate([view.corners_px for view in views])
-        self._middle = board.points_mm().mean(axis=0)
+        self._middle, self._square_mm = board.points_mm().mean(axis=0), board.square_mm
         self._stands = sorted({view.stand for view in views})
         self._up, self._origin = first_axis(views, poses, self._middle)
         # Two directions across the axis, in which the point on the axis may move and the axis may lean.
@@ -260,33 +263,54 @@ class _Axis:
         tried = [self._solved(start, evaluations=15) for start in starts]
         solved = self._solved(min(tried, key=lambda found: float(found.cost)).x, evaluations=60)
         self.lens = solved.x[7:FIRST_POSE].tolist()
-        residuals = self._residuals(solved.x)[: -self._known.size]
+        known = self._known.size
+        residuals = self._residuals(solved.x)[:-known]
         squares = (residuals.reshape(-1, 2) ** 2).sum(axis=1)
         ends = np.cumsum([len(part) for part in self._points])[:-1]
         self.view_rms_px = [round(float(np.sqrt(part.mean())), 3) for part in np.split(squares, ends)]
         freedom = max(residuals.size - solved.x.size, 1)
         rms = float(np.sqrt(squares.mean()))
-        covariance = np.linalg.inv(solved.jac.T @ solved.jac) * float((residuals**2).sum()) / freedom
+        # The corners scatter as their residuals show, the known values as they are known: `CORNER_PX` in their rows.
+        inverse = np.linalg.inv(solved.jac.T @ solved.jac)
+        covariances = [
+            inverse @ rows.T @ rows @ inverse * variance
+            for rows, variance in (
+                (solved.jac[:-known], float((residuals**2).sum()) / freedom),
+                (solved.jac[-known:], CORNER_PX**2),
+            )
+        ]
         # Uncertainties of the reported quantities: their derivatives by the parameters, from differences.
         reported = self._reported(solved.x)
-        steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-12
+        steps = np.sqrt(np.diag(sum(covariances))) * 1e-2 + 1e-12
         jacobian = np.column_stack(
             [
                 (self._reported(solved.x + step * unit) - reported) / step
                 for step, unit in zip(steps, np.eye(steps.size), strict=True)
             ]
         )
-        sigma = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+        sigma = np.sqrt([np.diag(jacobian @ covariance @ jacobian.T) for covariance in covariances])
         names = ("x", "y", "z", "ux", "uy", "uz", "px", "py", "wobble")
         units = ("mm", "mm", "mm", "", "", "", "px", "px", "°")
         estimates = {
-            name: Estimate(float(value), float(s), unit)
-            for name, unit, value, s in zip(names, units, reported, sigma, strict=True)
+            name: self._estimate(value, unit, of)
+            for name, unit, value, of in zip(names, units, reported.tolist(), sigma.T, strict=True)
         }
-        for name in ("px", "py"):
-            estimates[name] = replace(estimates[name], uncertainty=hypot(estimates[name].uncertainty, BIAS_PX))
-        estimates["eccentricity"] = Estimate(self.radii_mm[0], float(np.linalg.norm(sigma[:3])), "mm of the board")
+        across = np.linalg.norm(sigma[:, :3], axis=1)
+        estimates["eccentricity"] = self._estimate(self.radii_mm[0], "mm of the board", across)
         return estimates, rms
+
+    def _estimate(self, value: float, unit: str, sigma: Floats) -> Estimate:
+        """Return an estimate; ``sigma`` (2,) are the contributions of the corners and of the known values."""
+        budget = [
+            Contribution("scatter of the corners about the fit", "A", float(sigma[0]), unit),
+            Contribution("calibration of the camera, and height of the bearing", "B", float(sigma[1]), unit),
+        ]
+        if unit == "px":
+            budget.append(Contribution("common error of all corners", "B", BIAS_PX, "px"))
+        if unit.startswith("mm"):
+            scale = value / self._square_mm
+            budget.append(Contribution("side of the board's squares, measured", "B", SQUARE_SIGMA_MM, "mm", scale))
+        return Estimate(value, tuple(budget), unit)
 
     def _solved(self, start: Floats, evaluations: int) -> Any:
         return least_squares(

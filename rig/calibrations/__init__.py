@@ -1,7 +1,7 @@
 """Calibration results of a bench: their files, and the settings that they apply."""
 
 from rig.calibrations.rejection import CalibrationRejection, RejectionCode
-from rig.calibrations.result import CalibrationResult, Estimate
+from rig.calibrations.result import CalibrationResult, Contribution, Estimate
 from rig.calibrations.store import BenchCalibration, CalibrationStatus, CalibrationStore, apparatus, apply_results
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "CalibrationResult",
     "CalibrationStatus",
     "CalibrationStore",
+    "Contribution",
     "Estimate",
     "RejectionCode",
     "apparatus",

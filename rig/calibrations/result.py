@@ -4,13 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
-from math import floor, log10
+from math import floor, hypot, log10
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     AwareDatetime,
     ConfigDict,
+    Field,
     FiniteFloat,
     PositiveFloat,
     TypeAdapter,
@@ -27,12 +28,49 @@ MAX_FILE_BYTES = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
+class Contribution:
+    """One source in the uncertainty budget of a quantity (JCGM 100:2008, 5.1).
+
+    Attributes
+    ----------
+    source
+        The source in words.
+    kind
+        "A": evaluated from the scatter of the measurements; "B": from other knowledge, such as a data sheet.
+    uncertainty, unit
+        The source's standard uncertainty.
+    sensitivity
+        Change of the quantity for a change of the source by 1.
+    """
+
+    source: str
+    kind: Literal["A", "B"]
+    uncertainty: Annotated[FiniteFloat, Field(ge=0)]
+    unit: str
+    sensitivity: FiniteFloat = 1.0
+
+    @property
+    def part(self) -> float:
+        """The contribution to the standard uncertainty of the quantity, in its unit."""
+        return abs(self.sensitivity) * self.uncertainty
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
-    """A quantity with its standard uncertainty, both in ``unit``."""
+    """A quantity and its uncertainty budget; ``unit`` is that of the value. The contributions are independent."""
 
     value: FiniteFloat
-    uncertainty: FiniteFloat
+    budget: tuple[Contribution, ...]
     unit: str
+
+    @property
+    def uncertainty(self) -> float:
+        """The standard uncertainty: the root of the sum of the squared contributions."""
+        return hypot(*(one.part for one in self.budget))
+
+    def share(self, one: Contribution) -> float:
+        """Return the share of a contribution in the variance."""
+        return (one.part / self.uncertainty) ** 2 if one.part else 0.0
 
     @property
     def expanded(self) -> str:
@@ -68,6 +106,10 @@ class CalibrationResult:
         Days for which the result is valid; None: until the device changes.
     when_utc
         Time of the calibration, by the bench's clock.
+    reference
+        What the quantities were compared with, in words.
+    operator
+        Who calibrated: the account, or the person at a page of a server.
     device
         The calibrated devices and their bench (`rig.calibrations.apparatus`). The result is valid only for them.
     evidence
@@ -86,6 +128,8 @@ class CalibrationResult:
     residual_unit: str
     rejections: tuple[CalibrationRejection, ...]
     when_utc: AwareDatetime
+    reference: str
+    operator: str
     device: Mapping[str, Any]
     evidence: Mapping[str, Any]
     settings: Mapping[str, Any] = field(default_factory=dict)

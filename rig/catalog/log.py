@@ -153,6 +153,11 @@ def entries(transaction: Transaction, since: datetime | None = None) -> list[Ent
     return found
 
 
+def operator() -> str:
+    """Return who acts: the person at a page of a server, or the account."""
+    return _OPERATOR.get() or str(author()["user"])
+
+
 def author() -> dict[str, Any]:
     """Return the columns that say who changes the catalog: account, computer and program."""
     try:

@@ -304,7 +304,7 @@ def correct(
 
 
 def _operator(operator: str | None) -> str:
-    return log.author()["user"] if operator is None else clean_text(operator, "operator")
+    return log.operator() if operator is None else clean_text(operator, "operator")
 
 
 def _append(

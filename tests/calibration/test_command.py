@@ -2,7 +2,8 @@
 
 import json
 from datetime import timedelta
-from html import escape
+from html import escape, unescape
+from math import sqrt
 from shutil import copytree
 
 import numpy as np
@@ -13,6 +14,7 @@ from calibration import camera_model, encoder, gyro_rotation, imu_mounting, tabl
 from calibration.procedures import Backlash, Encoder, GyroRotation, GyroScale, ImuMounting
 from calibration.report import plots
 from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
+from rig.catalog import log
 from rig.cli.main import app
 from rig.core.clock import SystemClock
 from rig.views.charuco_board import CharucoBoard
@@ -42,7 +44,8 @@ def imu_calibration(tmp_path_factory):
         mounting = imu_mounting.evaluate(*measured(), column=2, sign=1)
         rotation = gyro_rotation.evaluate(moves(0), resolution_deg=1e-6)
         for procedure, found in ((ImuMounting, mounting), (GyroRotation, rotation)):
-            result = found.result(when_utc=SystemClock().utc(), device={})
+            who = {"reference": procedure.reference, "operator": log.operator()}
+            result = found.result(when_utc=SystemClock().utc(), device={}, **who)
             patch.setattr(procedure, "live", lambda *_, result=result: (one for one in [result]))
         return calibrated(tmp_path_factory.mktemp("imu"), *words)
 
@@ -150,7 +153,18 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
     assert rig("calibrate", "report", "--out", "page.html").exit_code == 0
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.count("valid until") == len(results)
-    assert f"U (k = 2) = {results[0].estimates['backlash'].expanded}" in page
+    for result in results:
+        assert result.reference in unescape(page)
+        assert result.operator == log.author()["user"]
+        for estimate in result.estimates.values():
+            assert f"U (k = 2) = {estimate.expanded}" in page
+            assert estimate.uncertainty == pytest.approx(sqrt(sum(one.part**2 for one in estimate.budget)))
+            assert sum(map(estimate.share, estimate.budget)) == pytest.approx(1.0)
+            for one in estimate.budget:
+                assert f"<td>{escape(one.source)}</td><td>{one.kind}</td>" in page
+    assert page.count('<th scope="rowgroup"') == sum(len(result.estimates) for result in results)
+    assert f"<td>{log.author()['user']}</td>" in page
+    assert "ChArUco board, 8 × 6 squares of 15 mm" in page
     assert page.count("<svg") == sum(map(len, pictures))
     for result, drawn in zip(results, pictures, strict=True):
         assert f'id="{result.name}"' in page
@@ -162,7 +176,8 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
 
 
 def test_person_at_a_terminal_is_asked_also_with_json(rig, monkeypatch):
-    nothing = camera_model.evaluate([], CharucoBoard(), (640, 480)).result(when_utc=SystemClock().utc(), device={})
+    found = camera_model.evaluate([], CharucoBoard(), (640, 480))
+    nothing = found.result(when_utc=SystemClock().utc(), reference="", operator="", device={})
     monkeypatch.setattr("calibration.procedure.in_force", lambda *_: nothing)
     monkeypatch.setattr("rig.cli.ui.prompts.is_interactive", lambda: True)
     done = rig("calibrate", "table", "--json", input="q\n")
@@ -181,13 +196,15 @@ def store(tmp_path, days: float, **device: str) -> None:
     CalibrationStore(tmp_path / "calibrations" / "sim").add(
         CalibrationResult(
             name=encoder.NAME,
-            estimates={"cos1": Estimate(0.0, 0.01, "°")},
+            estimates={"cos1": Estimate(0.0, (), "°")},
             residual=None,
             limit=None,
             residual_unit="°",
             rejections=(),
             when_utc=SystemClock().utc() - timedelta(days=days),
             valid_days=30.0,
+            reference="",
+            operator="",
             device=device,
             evidence={"steps": [], "revolution_deg": 360.0},
         )

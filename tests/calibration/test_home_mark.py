@@ -25,7 +25,7 @@ def intrinsics(optics: Optics) -> CalibrationResult:
     found = Evaluation(name=camera_model.NAME)
     for name, value in zip(names, values, strict=True):
         found.estimate(name, value, 0.01)
-    return found.result(when_utc=SystemClock().utc(), device={})
+    return found.result(when_utc=SystemClock().utc(), reference="", operator="", device={})
 
 
 def measured(bench, optics: Optics) -> Evaluation:
@@ -54,7 +54,9 @@ def test_card_shows_the_angle_from_all_sides_that_it_faces(simulated):
 def test_home_after_a_power_loss_needs_only_the_revolution(rig, tmp_path, simulated):
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\nstate_dir = "state"\ncalibration_dir = "calibrations"\n')
     s = simulated("camera.width=640", "camera.height=480", "view.roi=[80, 0, 480, 480]")
-    result = measured(s.bench, s.operator.optics).result(when_utc=SystemClock().utc(), device={}, valid_days=365)
+    result = measured(s.bench, s.operator.optics).result(
+        when_utc=SystemClock().utc(), reference="", operator="", device={}, valid_days=365
+    )
     CalibrationStore(Path("calibrations/sim")).add(result)
     rig("goto", "35")
     store = FileStore(Path("state/sim"))

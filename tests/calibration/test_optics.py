@@ -23,7 +23,9 @@ ALL = tuple(STANDS)
 
 
 def camera(views: list[BoardView], board: CharucoBoard | None = None) -> CalibrationResult:
-    return camera_model.evaluate(views, board or CharucoBoard(), (640, 480)).result(when_utc=WHEN, device={})
+    return camera_model.evaluate(views, board or CharucoBoard(), (640, 480)).result(
+        when_utc=WHEN, reference="", operator="", device={}
+    )
 
 
 def axis(views: list[BoardView], intrinsics: CalibrationResult) -> Evaluation:

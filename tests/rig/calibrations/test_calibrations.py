@@ -13,6 +13,7 @@ from rig.calibrations import (
     CalibrationResult,
     CalibrationStatus,
     CalibrationStore,
+    Contribution,
     Estimate,
     RejectionCode,
     apply_results,
@@ -21,14 +22,22 @@ from rig.config import RigConfig, load_config
 from rig.core.errors import ConfigError, UsageError
 from rig.core.next_steps import Do
 
+
+def scatter(uncertainty: float, unit: str = "1") -> tuple[Contribution, ...]:
+    """Return a budget with one contribution."""
+    return (Contribution("scatter", "A", uncertainty, unit),)
+
+
 RESULT = CalibrationResult(
     name="imu.scale",
-    estimates={"scale": Estimate(1.01, 1e-4, "1")},
+    estimates={"scale": Estimate(1.01, scatter(1e-4), "1")},
     residual=0.02,
     limit=0.1,
     residual_unit="°",
     rejections=(),
     when_utc=datetime(2026, 3, 1, 12, tzinfo=UTC),
+    reference="encoder of the servo",
+    operator="A. Silva",
     device={"bench": "sim", "imu": {"model": "MPU-6050"}},
     evidence={"legs": [{"encoder_deg": 360.0}]},
 )
@@ -43,17 +52,20 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     value=finite,
-    uncertainty=finite,
+    uncertainty=st.floats(0, allow_infinity=False),
+    sensitivity=finite,
     residual=st.none() | finite,
     rejections=st.lists(
         st.builds(CalibrationRejection, st.just(RejectionCode.WRONG_DIRECTION), st.just({"ratio": -1.0}))
     ).map(tuple),
     when=st.datetimes(datetime(1971, 1, 1), datetime(2200, 1, 1)),
 )
-def test_written_result_is_read_again(tmp_path, value, uncertainty, residual, rejections, when):
+def test_written_result_is_read_again(tmp_path, value, uncertainty, sensitivity, residual, rejections, when):
     result = replace(
         RESULT,
-        estimates={"scale": Estimate(value, uncertainty, "1")},
+        estimates={
+            "scale": Estimate(value, (*scatter(1.0), Contribution("noise", "B", uncertainty, "°", sensitivity)), "1")
+        },
         residual=residual,
         rejections=rejections,
         when_utc=when.replace(tzinfo=timezone(timedelta(hours=2))),
@@ -76,7 +88,15 @@ def test_file_is_readable_text(tmp_path):
 @pytest.mark.parametrize(
     ("change", "mistake"),
     [
-        ({"estimates": {"scale": {"value": "much", "uncertainty": 1, "unit": ""}}}, "estimates: scale: value"),
+        ({"estimates": {"scale": {"value": "much", "budget": [], "unit": ""}}}, "estimates: scale: value"),
+        (
+            {"estimates": {"scale": {"value": 1, "budget": [{"kind": "C"}], "unit": ""}}},
+            "estimates: scale: budget: 0: kind",
+        ),
+        (
+            {"estimates": {"scale": {"value": 1, "budget": [{"uncertainty": -1}], "unit": ""}}},
+            "estimates: scale: budget: 0: uncertainty: Input should be greater",
+        ),
         ({"estimates": {}}, "needs an estimate"),
         ({"valid_days": -1}, "valid_days"),
         ({"when_utc": "2026-03-01T12:00:00"}, "when_utc"),
@@ -211,5 +231,14 @@ def test_rejection_states_its_numbers():
 
 
 def test_expanded_uncertainty_is_twice_the_standard_uncertainty():
-    assert Estimate(1.0, 0.0165, "°").expanded == "0.033°"
-    assert Estimate(1.0, 0.0, "°").expanded == ""
+    assert Estimate(1.0, scatter(0.0165, "°"), "°").expanded == "0.033°"
+    assert Estimate(1.0, (), "°").expanded == ""
+
+
+def test_uncertainty_is_the_root_of_the_sum_of_the_squared_contributions():
+    noise = Contribution("noise", "B", 0.5, "mm", -8.0)
+    estimate = Estimate(1.0, (*scatter(3.0, "°"), noise), "°")
+    assert (noise.part, estimate.uncertainty) == (4.0, 5.0)
+    assert [estimate.share(one) for one in estimate.budget] == pytest.approx([0.36, 0.64])
+    nothing = Estimate(1.0, scatter(0.0), "°")
+    assert (nothing.uncertainty, nothing.share(nothing.budget[0])) == (0.0, 0.0)

@@ -292,12 +292,14 @@ def test_catalog_with_orphaned_rows_is_damaged(bench):
 def result(bench, days_ago: float, valid_days: float | None = None, **device: object) -> CalibrationResult:
     return CalibrationResult(
         name="imu.scale",
-        estimates={"scale": Estimate(1.01, 0.001, "")},
+        estimates={"scale": Estimate(1.01, (), "")},
         residual=0.1,
         limit=0.2,
         residual_unit="°",
         rejections=(),
         when_utc=bench.context.computer.clock.utc() - timedelta(days=days_ago),
+        reference="",
+        operator="",
         device=device,
         evidence={},
         valid_days=valid_days,

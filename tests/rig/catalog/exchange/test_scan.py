@@ -30,9 +30,13 @@ TRUE = optics(0)
 def results() -> tuple[CalibrationResult, CalibrationResult]:
     when = VirtualClock().utc()
     views = seen(TRUE, tuple(STANDS), camera_model.ANGLES_DEG[::2])
-    camera = camera_model.evaluate(views, CharucoBoard(), (640, 480)).result(when_utc=when, device={})
+    camera = camera_model.evaluate(views, CharucoBoard(), (640, 480)).result(
+        when_utc=when, reference="", operator="", device={}
+    )
     views = seen(TRUE, table_axis.STANDS, table_axis.ANGLES_DEG[::2])
-    return camera, table_axis.evaluate(views, CharucoBoard(), camera).result(when_utc=when, device={})
+    return camera, table_axis.evaluate(views, CharucoBoard(), camera).result(
+        when_utc=when, reference="", operator="", device={}
+    )
 
 
 @pytest.fixture

@@ -125,6 +125,8 @@ def test_show_reports_calibrations_in_force(rig, tmp_path):
             residual_unit="",
             rejections=(),
             when_utc=SystemClock().utc() - timedelta(days=2),
+            reference="",
+            operator="",
             device={"bench": "sim", "imu": {"axis": "z", "sign": 1}},
             evidence={},
             settings=settings,
@@ -133,9 +135,9 @@ def test_show_reports_calibrations_in_force(rig, tmp_path):
         CalibrationStore(folder / "sim").add(result)
         return result.id
 
-    scale = store("imu.scale", {"imu.scale": 1.02}, Estimate(1.02, 0.001, ""))
-    store("servo.backlash", {"table.backlash_deg": 0.2}, Estimate(0.2, 0.01, "°"))
-    store("table.axis", {"view.roi": [0, 0, 100, 100]}, Estimate(1.0, 0.1, "mm"), valid_days=1)
+    scale = store("imu.scale", {"imu.scale": 1.02}, Estimate(1.02, (), ""))
+    store("servo.backlash", {"table.backlash_deg": 0.2}, Estimate(0.2, (), "°"))
+    store("table.axis", {"view.roi": [0, 0, 100, 100]}, Estimate(1.0, (), "mm"), valid_days=1)
 
     arguments = ("config", "show", "--set", "table.backlash_deg=0.4")
     found = json.loads(rig(*arguments, "--json").stdout)
