@@ -22,7 +22,7 @@ class Cable(Procedure):
     """A procedure in which the operator shows both ends of the cable. The servo moves nothing."""
 
     names, title, devices, valid_days = (NAME,), "ends of the cable", ("servo",), 365
-    reference = "the operator's hand; encoder of the servo"
+    reference = "encoder of the servo"
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         bench.servo.torque_off()

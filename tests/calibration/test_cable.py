@@ -5,6 +5,7 @@ import pytest
 from calibration.cable import MARGIN_DEG, Cable, evaluate
 from calibration.procedure import Ask
 from rig.calibrations import RejectionCode, apply_results
+from rig.catalog.log import asked_by
 from tests.calibration.rejected import codes
 
 
@@ -42,6 +43,12 @@ def test_impossible_ends_are_rejected(high, low, pan, code):
     result = evaluate(high, low, pan=pan)
     assert codes(result) == [code]
     assert not result.settings
+
+
+def test_result_names_reference_and_person_at_the_page(simulated):
+    with asked_by("A. Silva"):
+        *_, result = Cable().live(simulated().bench)
+    assert (result.reference, result.operator) == ("encoder of the servo", "A. Silva")
 
 
 def test_pan_table_needs_no_whole_revolution():
