@@ -53,6 +53,7 @@ def test_true_values_lie_within_the_stated_uncertainty():
     assert abs(np.mean(z)) < 0.15
 
 
+@pytest.mark.nightly
 def test_applied_result_corrects_the_table_angle(simulated, tmp_path):
     s = simulated(noise=NoiseModel(encoder_harmonic_deg=0.3, backlash_deg=0.0), seed=11)
 

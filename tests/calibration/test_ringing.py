@@ -77,10 +77,11 @@ def test_table_with_little_damping_never_rests_without_calibration():
         settling_s(bench, wires, UPWARDS_DEG)
 
 
+@pytest.mark.nightly
 def test_true_values_lie_within_the_stated_uncertainty():
     rng = np.random.default_rng(1)
     z = []
-    for _ in range(5):
+    for _ in range(12):
         hz, damping = rng.uniform(6, 20), rng.uniform(0.02, 0.2)
         estimates = evaluate(drawn(rng, hz, damping)).estimates
         for name, truth in (("frequency", hz), ("damping", damping)):

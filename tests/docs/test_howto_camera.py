@@ -4,6 +4,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 import cv2
+import pytest
 
 from rig import Catalog, enroll
 from rig.config import load_config
@@ -36,6 +37,7 @@ class VendorCamera:
         self._capture.release()
 
 
+@pytest.mark.nightly
 def test_new_camera_takes_the_views_of_an_enrollment(monkeypatch, tmp_path):
     world = World(seed=1)
     config = load_config(None, [f"state_dir={tmp_path}/state", "servo.write_settings=true"])

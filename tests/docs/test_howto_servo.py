@@ -80,6 +80,7 @@ def stepper(monkeypatch, tmp_path):
     return load_config(None, ["servo.model=stepper", "table.zero_deg=0"])
 
 
+@pytest.mark.nightly
 def test_servo_of_another_make_rotates_the_table_for_an_enrollment(stepper, tmp_path):
     world = World(seed=1)
     with SimDevices.connected(load_config(None, []), world) as devices:

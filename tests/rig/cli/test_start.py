@@ -70,8 +70,7 @@ def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words,
     ("moment", "words"),
     [
         ("atexit", "--version"),
-        ("threads", "config show"),
-        pytest.param("threads", "--version", marks=pytest.mark.nightly),
+        *(pytest.param("threads", words, marks=pytest.mark.nightly) for words in ("config show", "--version")),
     ],
 )
 def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, words, tmp_path):

@@ -47,12 +47,12 @@ def accepted(index: int) -> Callable[[Event], bool]:
         case(False, accepted(2), None, "Ctrl+C", "at-rest-in-the-pause", nightly=True),
         case(False, accepted(2), 150.0, "rig stop", "at-rest-in-the-next-rotation", nightly=True),
         case(False, accepted(2), 150.0, "Ctrl+C", "at-rest-in-the-next-rotation"),
-        case(True, accepted(1), None, "rig stop", "after-the-revolution-in-the-pause", nightly=True),
+        case(True, accepted(1), None, "rig stop", "after-the-revolution-in-the-pause"),
         case(True, accepted(1), None, "Ctrl+C", "after-the-revolution-in-the-pause", nightly=True),
         case(True, accepted(VIEWS - 1), 200.0, "rig stop", "after-the-revolution-on-the-way-home", nightly=True),
         case(True, accepted(VIEWS - 1), 200.0, "Ctrl+C", "after-the-revolution-on-the-way-home", nightly=True),
         case(True, scan_started, 340.0, "rig stop", "in-the-revolution", nightly=True),
-        case(True, scan_started, 340.0, "Ctrl+C", "in-the-revolution"),
+        case(True, scan_started, 340.0, "Ctrl+C", "in-the-revolution", nightly=True),
     ],
 )
 def test_stop_after_a_pause(

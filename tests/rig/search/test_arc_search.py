@@ -196,9 +196,10 @@ def test_search_at_rest_stays_without_calibration_and_motion_asks_for_it(model: 
             list(identify(bench, model, strategy="arc"))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("fault", "at_rest"),
-    [("camera.stuck@0.8s+1.5s", 1), pytest.param("camera.off@0.8s+4s", 2, marks=pytest.mark.nightly)],
+    [("camera.stuck@0.8s+1.5s", 1), ("camera.off@0.8s+4s", 2)],
 )
 def test_table_continues_to_rotate_while_the_camera_delivers_nothing(model: Model, fault: str, at_rest: int) -> None:
     """Frames of the same arc end the search, or a view at rest where the arc has ended."""

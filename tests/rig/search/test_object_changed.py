@@ -21,6 +21,9 @@ from sim.objects.shelf import shelf
 from sim.world import World
 from tests.rig.motion.times import SMALL, camera_time
 
+pytestmark = pytest.mark.nightly
+"""The golden session identify-replaced is the default test of this."""
+
 T = TypeVar("T")
 TOY_CAR = sorted(shelf()).index("toy-car") + 1
 REPLACED = f"object_moved:other={TOY_CAR}@move1"
@@ -62,7 +65,6 @@ def of_kind(kind: type[T], events: list[Event]) -> list[T]:
     return [event for event in events if isinstance(event, kind)]
 
 
-@pytest.mark.nightly
 def test_last_steps_use_the_views_of_the_new_object_alone(model: Model, tmp_path: Path) -> None:
     mug = sorted(shelf()).index("mug-star") + 1
     with opened(f"object_moved:other={mug}:angle=90@move1", "object_moved:other=0@move3", yaw_deg=150.0) as bench:
@@ -72,7 +74,6 @@ def test_last_steps_use_the_views_of_the_new_object_alone(model: Model, tmp_path
     assert set(answer.possible) <= {"mug-white", "mug-star"}
 
 
-@pytest.mark.nightly
 def test_less_evidence_is_needed_if_the_gyro_saw_the_platter_move(model: Model) -> None:
     needed = {}
     for faults in ((REPLACED,), (REPLACED, "slip:angle=8@move1")):
@@ -96,7 +97,6 @@ def test_result_has_the_image_and_the_views_of_the_new_object(model: Model, tmp_
         assert list(result.azimuths_deg) == [event.azimuth_deg for event in new]
 
 
-@pytest.mark.nightly
 def test_watch_continues_with_the_next_object_after_a_change(model: Model) -> None:
     with opened(REPLACED) as bench:
         events, answers = [], []
