@@ -20,8 +20,8 @@ _last: list[threading.Thread] = []
 def notify(command: Sequence[str], message: Mapping[str, Any]) -> None:
     """Run a command with a message as JSON on its stdin, beside the bench: this returns at once.
 
-    Commands run one after the other, in the order of the calls. The program ends when the last one has ended, each after
-    `LIMIT_S` at most. If a command fails, a warning is printed.
+    Commands run one after the other, in the order of the calls. The program ends when the last one has ended, each
+    after `LIMIT_S` at most. If a command fails, a warning is printed.
     """
     if command:
         content = json.dumps(plain(message), ensure_ascii=False, default=str) + "\n"
