@@ -151,6 +151,27 @@ def similar_objects(views: Views, object_index: int, most: int) -> tuple[Confusa
     return tuple(found)
 
 
+def extreme_pairs(views: Views, object_index: int, other: int) -> list[tuple[int, int, float]]:
+    """Return where two objects look most alike, and where they differ most.
+
+    They differ most where the object looks least like the other one for how little it looks like its own neighbours
+    there, as in `similar_objects`: seen along its handle, a cup looks like no view but that one.
+
+    Returns
+    -------
+    list of (int, int, float)
+        For each of the two: the place among the object's views, the place among the other one's of the view that looks
+        most like it, and their similarity.
+    """
+    rows = views.of(object_index)
+    order = np.argsort(views.azimuth_deg[rows], kind="stable")
+    kind, own = descriptor(views.descriptor), views.levels(rows[order])
+    similar = kind.similarity(own, views.levels(views.of(other)))
+    reach = similar.max(axis=1)
+    places = reach.argmax(), (reach - _enough(kind, own)).argmin()
+    return [(int(order[at]), int(similar[at].argmax()), float(reach[at])) for at in places]
+
+
 def _enough(kind: Descriptor, descriptors: LevelArray) -> FloatArray:
     """Return the similarity from which each view, in their order around the object, looks like another object."""
     own = kind.similarity(descriptors, descriptors)

@@ -5,8 +5,8 @@ from typing import Annotated, Final
 from fastapi import Query, Request, Response
 from pydantic import BaseModel
 
-import hbr
 from hbr.core.angles import wrap180
+from hbr.model.symmetry import extreme_pairs
 from rig.catalog import Catalog, View
 from rig.catalog.derived import silhouette, views
 from rig.core.errors import JobNotFound
@@ -86,22 +86,19 @@ def add_pictures(routes: Routes, server: Server) -> None:
             if not item.views:
                 raise _not_enrolled(item.summary.name)
         numbers = [known.object_names.index(item.summary.name) for item in (one, two)]
-        own, others = (known.select(known.object_index == number).descriptors for number in numbers)
-        similar = hbr.tanimoto(own, others)
-        best = similar.argmax(axis=1)
-        value = similar.max(axis=1)
 
-        def pair(at: int) -> Pair:
-            first, second = one.views[at], two.views[int(best[at])]
+        def pair(own: int, others: int, similarity: float) -> Pair:
+            first, second = one.views[own], two.views[others]
             return Pair(
                 view=first.id,
                 azimuth_deg=first.azimuth_deg,
                 other_view=second.id,
                 other_azimuth_deg=second.azimuth_deg,
-                similarity=float(value[at]),
+                similarity=similarity,
             )
 
-        return Pairs(alike=pair(int(value.argmax())), different=pair(int(value.argmin())))
+        alike, different = (pair(*found) for found in extreme_pairs(known, *numbers))
+        return Pairs(alike=alike, different=different)
 
 
 def _not_enrolled(name: str) -> JobNotFound:

@@ -1,11 +1,13 @@
 """A server process, and a browser that uses its pages: `make test-web` installs what these tests need."""
 
+import json
 import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +33,16 @@ class ServerProcess:
     def kill(self, number: int = signal.SIGKILL) -> int:
         self.process.send_signal(number)
         return self.process.wait(30)
+
+
+def call(server: ServerProcess, path: str, body: Any = None, method: str | None = None) -> Any:
+    """Return what the server answers to a request of the API."""
+    data = None if body is None else json.dumps(body).encode()
+    request = urllib.request.Request(
+        f"{server.url}api/v1/{path}", data, {"Content-Type": "application/json"}, method=method
+    )
+    with urllib.request.urlopen(request, timeout=20) as answer:
+        return json.load(answer)
 
 
 @pytest.fixture

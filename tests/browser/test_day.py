@@ -1,12 +1,13 @@
 """A day at the simulated bench, operated only by clicks in a real Chromium with its back/forward cache."""
 
 import signal
+import socket
 import subprocess
-import sys
 
 import pytest
 
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+from tests.browser.conftest import RIG, call
+
 pytestmark = pytest.mark.nightly  # make test-web runs them
 PHONE = {"width": 390, "height": 844}
 WAIT_MS = 60_000
@@ -198,6 +199,41 @@ def test_watch_mode_names_one_object_after_the_other(page, serve_process):
     assert page.locator("#answer.found").count() == 1  # the last answer stays
 
 
+def test_answer_is_shown_beside_the_enrolled_object_that_looks_most_like_it(page, serve_process):
+    server = serve_process("bench.sim.speed=1000", 'bench.sim.object="lamp"')
+    for name in ("lamp", "mug-star", "mug-white"):
+        job = call(server, "jobs", {"kind": "enroll", "name": name, "views": 12})["id"]
+        while (state := call(server, f"jobs/{job}")["state"]) in ("queued", "running"):
+            pass
+        assert state == "done"
+    # Stored searches: the panel must not depend on the views that a search takes, nor on the load of the computer.
+    candidates = [{"name": "mug-star", "score": 0.9, "pose_deg": 20.0, "probability": 0.99}]
+    answer = {"event": "identified", "outcome": "found", "name": "mug-star", "views": 1, "candidates": candidates}
+    stored = {**call(server, f"jobs/{job}"), "id": "stored", "request": {"kind": "identify", "watch": False}}
+
+    def open_with(**values):
+        events = {"items": [{"event": "started", "job": "stored"}, {**answer, **values, "job": "stored"}], "last": "0"}
+        page.unroute_all()
+        page.route("**/api/v1/jobs?limit=50", lambda route: route.fulfill(json={"items": [stored], "next": None}))
+        page.route("**/api/v1/jobs/stored/events", lambda route: route.fulfill(json=events))
+        page.goto(f"{server.url}identify")
+
+    for values, words in (
+        ({}, "mug-star and mug-white differ most here"),
+        ({"outcome": "ambiguous", "possible": ["mug-white", "mug-star"]}, "mug-white and mug-star differ most here"),
+    ):
+        open_with(**values)
+        page.wait_for_selector(f"#twin-title:has-text('{words}')", timeout=WAIT_MS)
+        for image in page.locator("#twin img").all():
+            image.evaluate("(image) => image.decode()")
+        assert page.locator("#twin img").count() == 2
+    lamp = {"name": "lamp", "candidates": [{**candidates[0], "name": "lamp"}, {**candidates[0], "name": "mug-star"}]}
+    with page.expect_response("**/api/v1/objects/lamp"):  # the page asks, and the lamp looks like no other object
+        open_with(**lamp)
+    page.wait_for_selector("#answer.found:has-text('lamp')")
+    assert page.is_hidden("#twin")
+
+
 def test_second_tab_is_the_same_operator_and_a_second_browser_takes_over(page, chromium, serve_process):
     server = serve_process("bench.sim.speed=4", 'bench.sim.object="lamp"')
     enroll(page, server, "lamp", 24)
@@ -296,7 +332,11 @@ def test_settings_are_searched_changed_and_undone(page, serve_process, tmp_path)
 
 def test_pages_pass_axe(page, serve_process):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="make test-web installs axe")
-    server = serve_process("bench.sim.speed=50", "enroll.views=6")
+    # One other bench has the state of this one, because it is this one; the other one does not answer.
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    benches = [f'serve.benches.left="http://127.0.0.1:{port}"', 'serve.benches.off="http://127.0.0.1:9"']
+    server = serve_process("bench.sim.speed=50", "enroll.views=6", *benches, options=("--port", str(port)))
     page.goto(f"{server.url}enroll")
     for name in ("mug-star", "mug-white"):
         put(page, name)
@@ -315,8 +355,11 @@ def test_pages_pass_axe(page, serve_process):
     for scheme in ("light", "dark"):
         page.emulate_media(color_scheme=scheme)
         names = ("", "enroll", "identify", "catalog", "object?name=mug-star", "calibrations", "runs", "log", "settings")
-        for name in (*names, "login"):
+        for name in (*names, "benches", "login"):
             page.goto(f"{server.url}{name}")
+            if name == "benches":
+                page.wait_for_selector("#benches section:has-text('Ready')")
+                page.wait_for_selector("#benches .error:has-text('does not answer')")
             page.wait_for_timeout(600)
             if name == "":
                 page.click("#camera summary")

@@ -6,22 +6,15 @@ import signal
 import socket
 import ssl
 import subprocess
-import sys
 import urllib.error
 import urllib.request
 from urllib.parse import urlsplit
 
 import pytest
 
+from tests.browser.conftest import RIG, call
+
 pytestmark = pytest.mark.nightly  # make test-web runs them
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
-
-
-def call(server, path, body=None):
-    data = None if body is None else json.dumps(body).encode()
-    request = urllib.request.Request(f"{server.url}api/v1/{path}", data, {"Content-Type": "application/json"})
-    with urllib.request.urlopen(request, timeout=20) as answer:
-        return json.load(answer)
 
 
 def connect(server):

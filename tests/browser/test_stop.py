@@ -1,6 +1,5 @@
 """STOP of a server process: in a browser as people use it, and beside exports and silent connections."""
 
-import json
 import os
 import signal
 import socket
@@ -16,7 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from rig.core.clock import SystemClock
-from tests.browser.conftest import RIG
+from tests.browser.conftest import RIG, call
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
 CLOCK = SystemClock()
@@ -26,19 +25,10 @@ SLOW = ("bench.sim.speed=1", "table.velocity_dps=20")
 """A rotation by 350° that takes 18 s: longer than any of these tests waits for a stop."""
 
 
-def call(server: Any, path: str, body: Any = None, method: str | None = None) -> Any:
-    data = None if body is None else json.dumps(body).encode()
-    request = urllib.request.Request(
-        f"{server.url}api/v1/{path}", data, {"Content-Type": "application/json"}, method=method
-    )
-    with urllib.request.urlopen(request, timeout=20) as answer:
-        return json.load(answer)
-
-
 def rotate(server: Any, angle_deg: float = 350.0) -> str:
     """Start a long rotation, and return the id of its job when the table moves."""
     job = call(server, "jobs", {"kind": "goto", "angle_deg": angle_deg})["id"]
-    while not call(server, "status").get("servo", {}).get("moving"):
+    while not (call(server, "status")["servo"] or {}).get("moving"):  # null until the bench is open
         CLOCK.sleep(0.05)
     return str(job)
 

@@ -4,7 +4,6 @@ import "./shelf.js";
 
 const SHOWN = 4; // candidates: more are unlikely, and push the steps out of sight
 const KEPT = 10;
-const TWIN = 0.6; // score of the second candidate from which the two are compared
 const EMPTY_TABLE = 606;
 
 // -- the form -----------------------------------------------------------------------------------------------------------
@@ -118,18 +117,22 @@ function setPictures(box, key, make) {
   box.replaceChildren(...make());
 }
 
-/** Show where two objects differ most, and where they look alike. */
-async function compare(one, other) {
+/**
+ * Show where two objects differ most. Without a second one it is the enrolled object that looks most like the first,
+ * if one does: a fact of the catalog, not of the views that this search happened to take.
+ */
+async function compare(one = "", other = "") {
   const key = `${one}/${other}`;
   if (twinOf === key) return;
   twinOf = key;
   $("twin").hidden = true;
-  if (!other) return;
-  const found = await get(`/pairs?object=${at(one)}&other=${at(other)}`).catch(() => null);
+  if (!one) return;
+  const twin = other || (await get(`/objects/${at(one)}`).catch(() => null))?.similar?.objects[0]?.name;
+  const found = twin && (await get(`/pairs?object=${at(one)}&other=${at(twin)}`).catch(() => null));
   if (!found || twinOf !== key) return;
-  $("twin-title").textContent = `${one} and ${other} differ most here`;
+  $("twin-title").textContent = `${one} and ${twin} differ most here`;
   const { different: pair } = found;
-  $("twin-pictures").replaceChildren(picture(viewPicture(pair.view), `${one} at ${pair.azimuth_deg.toFixed(0)}°`, h("strong", {}, one), `at ${pair.azimuth_deg.toFixed(0)}°`), picture(viewPicture(pair.other_view), `${other} at ${pair.other_azimuth_deg.toFixed(0)}°`, h("strong", {}, other), `at ${pair.other_azimuth_deg.toFixed(0)}°`));
+  $("twin-pictures").replaceChildren(picture(viewPicture(pair.view), `${one} at ${pair.azimuth_deg.toFixed(0)}°`, h("strong", {}, one), `at ${pair.azimuth_deg.toFixed(0)}°`), picture(viewPicture(pair.other_view), `${twin} at ${pair.other_azimuth_deg.toFixed(0)}°`, h("strong", {}, twin), `at ${pair.other_azimuth_deg.toFixed(0)}°`));
   $("twin").hidden = false;
 }
 
@@ -137,7 +140,6 @@ function showAnswer(answer) {
   const { candidates = [], outcome } = answer;
   const used = counted(answer.views ?? answer.search?.views.length ?? 0, "view");
   const time = `${when(answer.time)}, ${used}`;
-  const second = candidates[1];
   let pictures = [];
   let after = [];
   if (outcome === "failed") {
@@ -162,8 +164,8 @@ function showAnswer(answer) {
   setPictures($("enrolled"), key, () => pictures.map(([one, words]) => enrolledPicture(one, words)));
   $("enrolled").hidden = !pictures.length;
   setPictures($("after"), key, () => after);
-  const twins = outcome === "ambiguous" ? answer.possible.slice(0, 2) : outcome === "found" && second?.score > TWIN ? [answer.name, second.name] : [];
-  compare(twins[0] || "", twins[1] || "");
+  const [one, other] = outcome === "ambiguous" ? answer.possible : [outcome === "found" ? answer.name : ""];
+  compare(one, other);
 }
 
 function showSearch() {
@@ -207,7 +209,7 @@ function redraw() {
   else {
     $("enrolled").hidden = true;
     $("after").replaceChildren();
-    compare("", "");
+    compare();
     if (job.state === "queued") headline("Waiting for the bench …", "calm");
     else if (!idle) headline(search.live && !search.views.length ? search.live : "Searching …", "calm", search.steps.at(-1)?.words || "");
   }

@@ -39,7 +39,12 @@ def test_picture_of_a_pose_is_the_nearest_view(enrolled):
 def test_twins_look_alike_from_behind_and_differ_at_the_star(enrolled):
     served, _ = enrolled
     pairs = get(served, "pairs?object=mug-star&other=mug-white").json()
-    assert pairs["alike"]["similarity"] > pairs["different"]["similarity"]
+    (twin,) = get(served, "objects/mug-star").json()["similar"]["objects"]
+    assert twin["name"] == "mug-white"
+    assert pairs["alike"]["similarity"] == pytest.approx(twin["similarity"])
+    assert pairs["different"]["similarity"] < pairs["alike"]["similarity"] - 0.02
+    assert any(start <= pairs["different"]["azimuth_deg"] <= end for start, end in twin["differs_deg"])
+    assert abs(pairs["different"]["azimuth_deg"] - 300) < 45  # the star is printed there
 
     def difference(pair):
         images = [
