@@ -16,9 +16,12 @@ from typing import Any
 
 import pytest
 
+from rig.core.clock import SystemClock
+
 pytest.importorskip("fastapi", reason="the extra hbr-rig[web] is not installed")
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+CLOCK = SystemClock()
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
@@ -43,6 +46,14 @@ def call(server: ServerProcess, path: str, body: Any = None, method: str | None 
     )
     with urllib.request.urlopen(request, timeout=20) as answer:
         return json.load(answer)
+
+
+def wait_for(server: ServerProcess, job: str, *states: str) -> str:
+    """Return the state of a job when it is one of these."""
+    while (state := call(server, f"jobs/{job}")["state"]) not in states:
+        assert state in ("queued", "running", "paused", "waiting"), state
+        CLOCK.sleep(0.05)
+    return str(state)
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ import subprocess
 
 import pytest
 
-from tests.browser.conftest import RIG, call
+from tests.browser.conftest import RIG, call, wait_for
+from tests.small import SMALL
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
 PHONE = {"width": 390, "height": 844}
@@ -200,12 +201,10 @@ def test_watch_mode_names_one_object_after_the_other(page, serve_process):
 
 
 def test_answer_is_shown_beside_the_enrolled_object_that_looks_most_like_it(page, serve_process):
-    server = serve_process("bench.sim.speed=1000", 'bench.sim.object="lamp"')
+    server = serve_process("bench.sim.speed=1000", 'bench.sim.object="lamp"', *SMALL)
     for name in ("lamp", "mug-star", "mug-white"):
         job = call(server, "jobs", {"kind": "enroll", "name": name, "views": 12})["id"]
-        while (state := call(server, f"jobs/{job}")["state"]) in ("queued", "running"):
-            pass
-        assert state == "done"
+        wait_for(server, job, "done")
     # Stored searches: the panel must not depend on the views that a search takes, nor on the load of the computer.
     candidates = [{"name": "mug-star", "score": 0.9, "pose_deg": 20.0, "probability": 0.99}]
     answer = {"event": "identified", "outcome": "found", "name": "mug-star", "views": 1, "candidates": candidates}

@@ -14,11 +14,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from rig.core.clock import SystemClock
-from tests.browser.conftest import RIG, call
+from tests.browser.conftest import CLOCK, RIG, call, wait_for
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
-CLOCK = SystemClock()
 PAGES = ("settings", "identify", "catalog", "calibrations", "runs", "log")
 WAIT_MS = 30_000
 SLOW = ("bench.sim.speed=1", "table.velocity_dps=20")
@@ -31,13 +29,6 @@ def rotate(server: Any, angle_deg: float = 350.0) -> str:
     while not (call(server, "status")["servo"] or {}).get("moving"):  # null until the bench is open
         CLOCK.sleep(0.05)
     return str(job)
-
-
-def wait_for(server: Any, job: str, *states: str) -> str:
-    while (state := call(server, f"jobs/{job}")["state"]) not in states:
-        assert state in ("queued", "running", "paused", "waiting"), state
-        CLOCK.sleep(0.05)
-    return str(state)
 
 
 def stopped(server: Any, job: str) -> None:
