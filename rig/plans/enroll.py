@@ -26,7 +26,7 @@ from rig.bench import Bench
 from rig.catalog import Catalog, OpenEnrollment, Provenance, View
 from rig.catalog.sessions import unfinished_camera_settings
 from rig.core.clock import seconds_between
-from rig.core.errors import LimitExceeded, ObjectMoved, ObjectNotFound, RigError, RotationDisagreement
+from rig.core.errors import LimitExceeded, NoObject, ObjectMoved, ObjectNotFound, RigError, RotationDisagreement
 from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
@@ -37,7 +37,7 @@ from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, scan_speed, takes_in_motion
 from rig.motion.turntable import Flight, Turntable
 from rig.plans.estimate import even_azimuths, table_angles
-from rig.plans.steps import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
+from rig.plans.steps import ObjectCheck, accepted, announced, capture, check_camera, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer, image_similarity
 from rig.views.description import DescribedView, ViewDescriber
 from rig.views.empty_table import empty_table_status
@@ -80,6 +80,9 @@ class EnrollmentViews:
     viewer: Viewer
     retakes: int = 0
     _first: _SeenView | None = None
+
+    def __post_init__(self) -> None:
+        self._check = ObjectCheck(self.bench, self.segment.empty_table)
 
     def take(self, angles_deg: Mapping[int, float], *, in_motion: bool) -> Generator[Event, None, None]:
         """Take and store the views at these table angles; check that the object was not moved; return to 0.
@@ -129,8 +132,7 @@ class EnrollmentViews:
             azimuth_deg = self._azimuth_deg(table_deg)
             attempt = yield from capture(index, self.viewer, self.table, move.settled_ns)
             self.retakes += attempt.number - 1
-            if self._first is None:
-                check_object(self.bench, attempt.image_bgr, azimuth_deg, self.segment.empty_table)
+            self._require_object(attempt.image_bgr, azimuth_deg)
             segmented = self.segment(attempt.image_bgr, azimuth_deg)
             yield from self._store(
                 index,
@@ -166,7 +168,7 @@ class EnrollmentViews:
         if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
             yield moved(0, (yield from announced(0, table, start_deg)))
         before = yield from capture(0, self.viewer, table, self.bench.clock.now_ns())
-        check_object(self.bench, before.image_bgr, self._azimuth_deg(start_deg), self.segment.empty_table)
+        self._require_object(before.image_bgr, self._azimuth_deg(start_deg))
         self._first = _SeenView(0, start_deg, before.image_bgr)
         yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
         frames = FlightFrames(self.bench, table)
@@ -203,9 +205,10 @@ class EnrollmentViews:
             if not attempt.accepted:
                 yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
                 continue
+            azimuth_deg = self._azimuth_deg(attempt.evidence.motion.angle_deg)
+            self._require_object(attempt.image_bgr, azimuth_deg)
             attempt = replace(attempt, encoded=encoder.submit(encode, attempt.image_bgr))
-            assert attempt.evidence.motion is not None
-            segmented = self.segment(attempt.image_bgr, self._azimuth_deg(attempt.evidence.motion.angle_deg))
+            segmented = self.segment(attempt.image_bgr, azimuth_deg)
             attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
             assert attempt.evidence.motion is not None
             measured_deg = attempt.evidence.motion.angle_deg
@@ -246,6 +249,15 @@ class EnrollmentViews:
 
     def _azimuth_deg(self, table_deg: float) -> float:
         return float(wrap360(self.bench.config.table.orientation_sign * table_deg))
+
+    def _require_object(self, image_bgr: NDArray[np.uint8], azimuth_deg: float) -> None:
+        """Check a view that is not stored yet; views of an empty table must not be continued."""
+        try:
+            self._check(image_bgr, azimuth_deg)
+        except NoObject:
+            if self._first is not None:
+                self.enrollment.abandon()
+            raise
 
     def _require_not_moved(self, first: _SeenView, again: Attempt) -> None:
         """Compare two frames of one angle; abandon the enrollment and raise `ObjectMoved` if the object moved."""
@@ -337,7 +349,8 @@ def enroll(
     Raises `ObjectExists`, `CatalogError`, `CatalogBusy`: see `Catalog.begin` and `Catalog.resume`.
     `CameraSettingsDiffer`: the camera has other settings than at the views to continue. `RotationDisagreement`: encoder
     and gyro differ by more than their uncertainty, or the gyro has no value: no view is stored at an uncertain angle.
-    `NoObject`: the first view shows the empty table: nothing is stored. `ObjectMoved`: the object is not where it was
+    `NoObject`: the table is empty. If its image shows that, nothing is stored, otherwise the views of this session are
+    abandoned (`rig.plans.steps.ObjectCheck`). `ObjectMoved`: the object is not where it was
     for the first view of this session: the enrollment is abandoned. `ViewRejected`, `LimitExceeded`, `MotionTimeout`,
     `DeviceFault`, `DeviceSilent`: see `rig.views.capture` and `rig.motion.turntable`; the views stored so far stay.
     """

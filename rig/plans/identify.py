@@ -10,7 +10,7 @@ Decisions: docs/decisions/0002, docs/decisions/0019.
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -53,7 +53,7 @@ from rig.motion.flight_views import FlightFrames
 from rig.motion.move import FIRST_REST_S, Move
 from rig.motion.scan_speed import can_fly, require_camera_time, scan_speed
 from rig.motion.turntable import Turntable
-from rig.plans.steps import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
+from rig.plans.steps import ObjectCheck, accepted, announced, capture, check_camera, moved, warn_of_table
 from rig.search.model import Model, begin_search, empty_table_for
 from rig.search.session import SHOWN, Search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
@@ -80,7 +80,7 @@ class ViewsAtRest:
     Attributes
     ----------
     check
-        Gets image and azimuth of the first view, and raises an error if it shows no object.
+        Gets image and azimuth of each view, and raises an error if the table is empty.
     live
         Called with the event of each frame of a search in motion.
     number
@@ -96,7 +96,7 @@ class ViewsAtRest:
     search: Search
     viewer: Viewer
     describe: SearchDescriber
-    check: Callable[[NDArray[np.uint8], float], None]
+    check: ObjectCheck
     live: Callable[[FrameUsed], object]
     first_rest_s: float = FIRST_REST_S
     number: int = 0
@@ -138,8 +138,7 @@ class ViewsAtRest:
         described = self.describe(captured.image_bgr, azimuth_deg)
         self.locks = captured.evidence.locks
         yield accepted(self.number, azimuth_deg, captured, described)
-        if self.number == 0:
-            self.check(captured.image_bgr, azimuth_deg)
+        self.check(captured.image_bgr, azimuth_deg)
         yield from warn_of_table(self.bench, self.number, described)
         self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
         if (changed := self.search.changed()) is not None:
@@ -206,6 +205,7 @@ class ViewsInMotion(ViewsAtRest):
     rejected: int = 0
     rejected_in_a_row: int = 0
     goal_deg: float = 0.0
+    _newest: tuple[NDArray[np.uint8], float] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -236,6 +236,8 @@ class ViewsInMotion(ViewsAtRest):
         self.unseen.clear()
         self.travelled_deg += abs(move.rotation_deg)
         yield moved(self.number, move)
+        if self._newest is not None:  # not in the control loop
+            self.check(*self._newest)
         if self.is_over:
             return
         self.flights += 1
@@ -267,6 +269,7 @@ class ViewsInMotion(ViewsAtRest):
         assert motion is not None
         azimuth_deg = float(wrap360(self.sign * motion.angle_deg))
         self.unseen.append(accepted(self.number, azimuth_deg, attempt, described))
+        self._newest = attempt.image_bgr, azimuth_deg
         self.search.add(described, azimuth_deg, table_deg=motion.angle_deg)
         if (changed := self.search.changed()) is not None:
             self.unseen.append(changed)
@@ -336,8 +339,8 @@ def identify(
         when it has stopped. It must return at once.
 
     Raises `CatalogError`: nothing is enrolled. `CameraSettingsDiffer`: all objects were enrolled with other settings of
-    the camera. `UsageError`: there is no such strategy, or the model is not for it. `NoObject`: the first view shows
-    the empty table. `ViewRejected`, `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see `rig.views.capture` and
+    the camera. `UsageError`: there is no such strategy, or the model is not for it. `NoObject`: the table is
+    empty. `ViewRejected`, `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see `rig.views.capture` and
     `rig.motion.turntable`.
     """
     config = config or bench.config
@@ -357,7 +360,7 @@ def identify(
         revise=not search.in_motion,
         enrolled_table=model.empty_table,
     )
-    check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
+    check = ObjectCheck(bench, empty_table if own is None else own.image_bgr)
     (placer or bench).place(None)
     yield Started(
         "identify",

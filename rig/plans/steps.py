@@ -1,12 +1,13 @@
 """The steps that the plans share: rotate, capture an accepted view, warn of a changed bench."""
 
 from collections.abc import Collection, Generator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hbr.core.angles import wrap180
 from rig.bench import Bench
 from rig.core.errors import CameraSettingsDiffer, NoObject, ViewRejected
 from rig.core.next_steps import Do, SomeSteps
@@ -17,7 +18,7 @@ from rig.safety.gyro_rotation import finite
 from rig.views.capture import Attempt, RejectReason, Viewer, rejection_text
 from rig.views.description import DescribedView
 from rig.views.empty_table import store_table_problem
-from rig.views.object_presence import is_empty_table
+from rig.views.object_presence import LEAST_ROTATION_DEG, is_empty_table, probability_of_nothing
 from rig.views.table_sheet import table_image
 
 
@@ -70,22 +71,57 @@ def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
     )
 
 
-def check_object(
-    bench: Bench, image_bgr: NDArray[np.uint8], azimuth_deg: float, empty_table: NDArray[np.uint8] | None
-) -> None:
-    """Check that the first view shows more than the empty table; without an empty-table image, more than one colour.
+@dataclass(eq=False)
+class ObjectCheck:
+    """Checks that an object is on the table; called with the views of one search or enrollment.
+
+    The first view must show more than the empty table; without an empty-table image for it, more than one colour. Then
+    it is also compared, once, with the first view that is `LEAST_ROTATION_DEG` away: something must rotate with the
+    table, or look like an object.
 
     ``empty_table`` is a sheet (`rig.views.table_sheet`).
     """
-    if is_empty_table(image_bgr, table_image(empty_table, image_bgr, azimuth_deg), bench.config.view):
-        raise NoObject(
-            "No object is on the table: nothing in the image differs from the background.",
-            next_step=(
-                "Put the object on the table, where the camera sees it, and repeat. If it is there already, take it "
-                "off, and",
-                Do.EMPTY_TABLE(),
-            ),
-        )
+
+    bench: Bench
+    empty_table: NDArray[np.uint8] | None
+    _first: tuple[NDArray[np.uint8], float] | None = field(default=None, init=False)
+    _is_done: bool = field(default=False, init=False)
+
+    def __call__(self, image_bgr: NDArray[np.uint8], azimuth_deg: float) -> None:
+        """Check the next view. Raises `NoObject`: no object is on the table."""
+        if self._is_done:
+            return
+        config = self.bench.config.view
+        if self._first is None:
+            self._first = image_bgr, azimuth_deg
+            table_bgr = table_image(self.empty_table, image_bgr, azimuth_deg)
+            if is_empty_table(image_bgr, table_bgr, config):
+                raise _no_object("nothing in the image differs from the background")
+            self._is_done = table_bgr is not None  # the image has decided, also for what the network does not know
+            return
+        first_bgr, first_deg = self._first
+        rotated_deg = abs(wrap180(azimuth_deg - first_deg))
+        if rotated_deg < LEAST_ROTATION_DEG:
+            return
+        self._is_done = True
+        probability = probability_of_nothing(first_bgr, image_bgr, config)
+        if probability is not None:
+            raise _no_object(
+                "nothing in the image rotates with the table, or looks like an object",
+                {"rotated_deg": round(rotated_deg, 1), "highest_probability": round(probability, 4)},
+            )
+
+
+def _no_object(reason: str, evidence: Mapping[str, float] | None = None) -> NoObject:
+    return NoObject(
+        f"No object is on the table: {reason}.",
+        next_step=(
+            "Put the object on the table, where the camera sees it, and repeat. If it is there already, take it off, "
+            "and",
+            Do.EMPTY_TABLE(),
+        ),
+        evidence=evidence,
+    )
 
 
 def warn_of_table(bench: Bench, index: int, view: DescribedView) -> Generator[Event, None, None]:

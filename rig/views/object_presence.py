@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.segmentation.background import SegmentedFrame
+from hbr.segmentation.background import Background, SegmentedFrame
+from hbr.segmentation.silhouette import shares
 from rig.bench import Bench
 from rig.config import ViewConfig
 from rig.core.clock import seconds_between
@@ -31,6 +32,12 @@ POLL_S: Final = 0.25
 
 SPECK: Final = np.ones((3, 3), np.uint8)
 """Smaller groups of pixels are noise, in images of 128 pixels: an object of 3 % of the image's width is larger."""
+
+LEAST_ROTATION_DEG: Final = 29.0  # of a step to 30°, with the error of the arrival
+"""After a smaller rotation, a small object beside the axis may not look different."""
+# an empty drawn bench has 0.001 or less, a photographed object 0.98 or more; between them a doubtful pixel is an object
+MOST_PROBABLE: Final = 0.05
+"""No pixel of an empty table shows the object with a higher probability by the segmentation's network."""
 
 Cells = NDArray[np.float32]
 
@@ -108,11 +115,37 @@ def is_empty_table(image_bgr: NDArray[np.uint8], empty_table_bgr: NDArray[np.uin
         cells = shrunk(image_bgr, config)
         return changed_cells(np.zeros_like(cells), cells) == 0
     frame, empty = (SegmentedFrame(within(one, config.roi)) for one in (image_bgr, empty_table_bgr))
-    found = frame.difference(hbr.Background(empty.image))
+    return _same(frame, empty)
+
+
+def probability_of_nothing(
+    first_bgr: NDArray[np.uint8], rotated_bgr: NDArray[np.uint8], config: ViewConfig
+) -> float | None:
+    """Return the highest probability of a pixel to show an object, if two views show an empty table; None otherwise.
+
+    Between the views of one size the table rotated by `LEAST_ROTATION_DEG` or more. A round object is not changed by
+    that, and a faint one is not seen by the network. So both must agree: nothing rotates, in any light, and the network
+    sees no object in either view, with and without the background that the other view shows. Marks on the platter and
+    surroundings that move leave it open.
+    """
+    first, rotated = (SegmentedFrame(within(one, config.roi)) for one in (first_bgr, rotated_bgr))
+    if not _same(rotated, first):
+        return None
+    highest = 0.0
+    for frame, other in ((first, rotated), (rotated, first)):
+        learned = Background.learned([other.small], other.image.shape[:2])
+        for difference in (None, learned.difference(frame.small)):
+            highest = max(highest, float(shares(frame.small, difference).object.max()))
+    return highest if highest <= MOST_PROBABLE else None
+
+
+def _same(frame: SegmentedFrame, other: SegmentedFrame) -> bool:
+    """Return whether a frame shows no speck and no cells that another one does not show, in any light."""
+    found = frame.difference(hbr.Background(other.image))
     if not found.reliable or cv2.erode((found.certain | found.possible).astype(np.uint8), SPECK).any():
         return False
     corrected = frame.small * np.exp(found.correction.over(*frame.small.shape[:2]))
-    return not changed(_cells(empty.small), _cells(corrected))
+    return not changed(_cells(other.small), _cells(corrected))
 
 
 def shrunk(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Cells:

@@ -2,7 +2,6 @@
 
 import pytest
 
-import hbr
 from rig.catalog import Catalog
 from rig.core.errors import NoObject
 from rig.events.events import Accepted, Failed, Identified, Ranked, ScanStarted, Started, Waiting
@@ -53,6 +52,14 @@ def bench(world):
 
 
 @pytest.fixture
+def plain_bench(world):
+    """The same bench without an empty-table image."""
+    with open_sim_bench(camera_time(world, *SMALL), ShelfOperator(world, shelf())) as bench:
+        bench.placer = None
+        yield bench
+
+
+@pytest.fixture
 def catalog(bench, tmp_path):
     with Catalog.open(tmp_path / "catalog", clock=bench.clock) as catalog:
         yield catalog
@@ -82,11 +89,22 @@ def test_empty_table_is_noticed_by_the_image_of_the_enrollment(bench, model, wor
     until_no_object(identify(bench, model))
 
 
-def test_without_an_empty_table_image_an_empty_table_is_unknown(simulated, models):
-    s = simulated()
-    s.bench.placer = None
-    *_, answer = identify(s.bench, models[1])
-    assert answer.outcome is hbr.Outcome.UNKNOWN
+@pytest.mark.parametrize("strategy", ["dense", "arc", "ahbr"])
+def test_without_an_empty_table_image_the_rotation_shows_that_the_table_is_empty(plain_bench, models, strategy):
+    events = until_no_object(identify(plain_bench, models[strategy == "ahbr"], strategy=strategy))
+    assert not any(isinstance(event, Identified) for event in events)
+    assert not plain_bench.servo.read_condition().torque
+
+
+@pytest.mark.parametrize("fly", [False, True])
+def test_without_an_empty_table_image_an_enrollment_of_nothing_ends_early(plain_bench, world, tmp_path, fly):
+    with Catalog.open(tmp_path / "catalog", clock=plain_bench.clock) as catalog:
+        events = until_no_object(enroll(plain_bench, catalog, "lamp", views=36, fly=fly))
+        assert len([event for event in events if isinstance(event, Accepted)]) <= 3  # of 36
+        assert catalog.resumable("lamp") is None  # views of an empty table are not continued
+        world.put(shelf()["lamp"])
+        *_, done = enroll(plain_bench, catalog, "lamp", views=4, fly=False)
+        assert done.views == 4
 
 
 @pytest.mark.parametrize("fly", [False, True])

@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 
+from hbr.evaluation.photographs import load_coil
 from rig.catalog import Catalog, derived
+from rig.config import ViewConfig
 from rig.core.errors import DeviceSilent
 from rig.events.events import Failed, Identified, Waiting
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify, watch
 from rig.search.model import model_of
-from rig.views.object_presence import TableWatcher, is_empty_table
+from rig.views.object_presence import TableWatcher, is_empty_table, probability_of_nothing
+from sim.motion import rest
 from sim.objects.shelf import shelf
 
 
@@ -122,6 +125,59 @@ def test_no_object_is_taken_for_an_empty_table(simulated):
     pale[60:180, 90:210] *= 1.2
     pale[60:180, 90:210] += 2.0
     assert not is_empty_table(np.clip(pale, 0, 255).astype(np.uint8), empty, config)
+
+
+def rotated_frames(s, angles_deg, lights=((1.0, 1.0, 1.0),)):
+    """Return a frame at each table angle, each in the next light."""
+    images = []
+    for n, angle_deg in enumerate(angles_deg):
+        s.world.change(light=lights[n % len(lights)])
+        s.world.drive(rest(s.world.clock.now_ns() * 1e-9, angle_deg))
+        images.append(frame(s))
+    return images
+
+
+def emptiness(s, images):
+    return [probability_of_nothing(images[0], later, s.bench.config.view) for later in images[1:]]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rotation_shows_that_the_table_is_empty_in_any_light(simulated, seed):
+    s = simulated(seed=seed)
+    lights = ((1.0, 1.0, 1.0), (0.6, 0.6, 0.6), (1.2, 1.1, 1.0))
+    assert None not in emptiness(s, rotated_frames(s, (0.0, 30.0, 90.0), lights))
+
+
+def test_rotation_leaves_it_open_if_the_platter_has_marks_or_the_surroundings_move(simulated):
+    s = simulated()
+    first, rotated = rotated_frames(s, (0.0, 90.0))
+    marked = rotated.copy()
+    marked[180:186, 150:160] = 200
+    assert emptiness(s, [first, marked, np.roll(rotated, 40, axis=1)]) == [None, None]
+
+
+@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.5, 0.5, 0.5)])
+def test_no_object_is_taken_for_nothing_although_it_looks_the_same_from_all_sides(simulated, light):
+    s = simulated()
+    for number, name in enumerate(shelf()):
+        put(s, name, 31.0 * number)()
+        first, rotated, again = rotated_frames(s, (0.0, 30.0, 0.0), (light,))
+        assert emptiness(s, [first, rotated, again]) == [None, None], name
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["coil-100", "eth-80"])
+def test_no_photographed_object_is_taken_for_nothing(rig_test_data, name):
+    dataset, config, rng = load_coil(rig_test_data / name), ViewConfig(roi=None), np.random.default_rng(0)
+    for j, item in enumerate(dataset.objects):
+        for start in range(0, len(item.photographs), len(item.photographs) // 4):
+            first = dataset.image(j, start)
+            later_deg = (item.azimuth_deg - item.azimuth_deg[start]) % 360
+            rotated = dataset.image(j, int(np.argmin(np.abs(later_deg - 30.0))))
+            again = np.clip(first + rng.normal(0, 1.5, first.shape), 0, 255).astype(np.uint8)
+            dimmed = np.clip(0.7 * rotated, 0, 255).astype(np.uint8)
+            for later in (rotated, dimmed, again):  # the last one: an object that is the same from all sides
+                assert probability_of_nothing(first, later, config) is None, (item.name, start)
 
 
 def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_path):
