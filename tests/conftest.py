@@ -127,6 +127,15 @@ def _buses_are_closed() -> Iterator[None]:
     assert open_files() <= before, "a simulated I2C bus is still open: close it, or use it in a with block"
 
 
+@pytest.fixture(scope="session")
+def rig_test_data() -> Path:
+    default = Path(__file__).parents[1] / ".." / "shared" / "data"
+    folder = Path(os.environ.get("RIG_TEST_DATA", default))
+    if not folder.is_dir():
+        pytest.skip(f"test data not found at {folder}; set RIG_TEST_DATA")
+    return folder
+
+
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     """Return a function that runs `rig ...` on the simulated bench in an empty folder, where all its data are."""

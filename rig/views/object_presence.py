@@ -35,9 +35,11 @@ SPECK: Final = np.ones((3, 3), np.uint8)
 
 LEAST_ROTATION_DEG: Final = 29.0  # of a step to 30°, with the error of the arrival
 """After a smaller rotation, a small object beside the axis may not look different."""
-# an empty drawn bench has 0.001 or less, a photographed object 0.98 or more; between them a doubtful pixel is an object
-MOST_PROBABLE: Final = 0.05
+# an empty simulated table has 0.0008 or less, a photographed object 0.9 or more; less if it is under 2 cm
+MOST_PROBABLE: Final = 0.002
 """No pixel of an empty table shows the object with a higher probability by the segmentation's network."""
+SAME_LEVELS: Final = 4.0  # twice the noise of the cells
+"""No cell changes by more than this when an empty table rotates."""
 
 Cells = NDArray[np.float32]
 
@@ -129,7 +131,7 @@ def probability_of_nothing(
     surroundings that move leave it open.
     """
     first, rotated = (SegmentedFrame(within(one, config.roi)) for one in (first_bgr, rotated_bgr))
-    if not _same(rotated, first):
+    if not _same(rotated, first, levels=SAME_LEVELS, cells=1):
         return None
     highest = 0.0
     for frame, other in ((first, rotated), (rotated, first)):
@@ -139,13 +141,13 @@ def probability_of_nothing(
     return highest if highest <= MOST_PROBABLE else None
 
 
-def _same(frame: SegmentedFrame, other: SegmentedFrame) -> bool:
+def _same(frame: SegmentedFrame, other: SegmentedFrame, *, levels: float = STEP_LEVELS, cells: int = CELLS) -> bool:
     """Return whether a frame shows no speck and no cells that another one does not show, in any light."""
     found = frame.difference(hbr.Background(other.image))
     if not found.reliable or cv2.erode((found.certain | found.possible).astype(np.uint8), SPECK).any():
         return False
     corrected = frame.small * np.exp(found.correction.over(*frame.small.shape[:2]))
-    return not changed(_cells(other.small), _cells(corrected))
+    return changed_cells(_cells(other.small), _cells(corrected), levels) < cells
 
 
 def shrunk(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Cells:
@@ -157,11 +159,11 @@ def _cells(image: NDArray[np.uint8] | NDArray[np.float32]) -> Cells:
     return cv2.resize(image, (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def changed_cells(a: Cells, b: Cells) -> int:
-    """Return how many cells differ, apart from a change of the illumination."""
+def changed_cells(a: Cells, b: Cells, levels: float = STEP_LEVELS) -> int:
+    """Return how many cells differ by more than this, apart from a change of the illumination."""
     difference = b - a
     difference -= np.median(difference, axis=(0, 1))
-    return int(np.count_nonzero(np.abs(difference).max(axis=2) > STEP_LEVELS))
+    return int(np.count_nonzero(np.abs(difference).max(axis=2) > levels))
 
 
 def changed(a: Cells, b: Cells) -> bool:

@@ -144,7 +144,7 @@ def emptiness(s, images):
 @pytest.mark.parametrize("seed", range(3))
 def test_rotation_shows_that_the_table_is_empty_in_any_light(simulated, seed):
     s = simulated(seed=seed)
-    lights = ((1.0, 1.0, 1.0), (0.6, 0.6, 0.6), (1.2, 1.1, 1.0))
+    lights = ((1.0, 1.0, 1.0), (0.75, 0.75, 0.75), (1.2, 1.1, 1.0))
     assert None not in emptiness(s, rotated_frames(s, (0.0, 30.0, 90.0), lights))
 
 
