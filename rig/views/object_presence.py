@@ -147,7 +147,7 @@ def _same(frame: SegmentedFrame, other: SegmentedFrame, *, levels: float = STEP_
     if not found.reliable or cv2.erode((found.certain | found.possible).astype(np.uint8), SPECK).any():
         return False
     corrected = frame.small * np.exp(found.correction.over(*frame.small.shape[:2]))
-    return changed_cells(_cells(other.small), _cells(corrected), levels) < cells
+    return changed_cells(_cells(other.small), _cells(corrected), levels=levels) < cells
 
 
 def shrunk(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Cells:
@@ -159,7 +159,7 @@ def _cells(image: NDArray[np.uint8] | NDArray[np.float32]) -> Cells:
     return cv2.resize(image, (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def changed_cells(a: Cells, b: Cells, levels: float = STEP_LEVELS) -> int:
+def changed_cells(a: Cells, b: Cells, *, levels: float = STEP_LEVELS) -> int:
     """Return how many cells differ by more than this, apart from a change of the illumination."""
     difference = b - a
     difference -= np.median(difference, axis=(0, 1))

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 from sim.bench import SimBenchKind
+from sim.objects.shelf import shelf
 from tests.small import SMALL_FILE
 
 
@@ -62,7 +63,7 @@ def rig(enrolled, monkeypatch):
 
 @pytest.fixture
 def with_operator(monkeypatch):
-    """Open the simulated bench without the operator that places objects; return its world."""
+    """Open the simulated bench with a lamp, without the operator that places objects; return its world."""
     opened = []
     really = SimBenchKind.open
 
@@ -70,6 +71,7 @@ def with_operator(monkeypatch):
         bench = really(self, config, options, seed)
         opened.append(bench.placer.world)
         bench.placer = None
+        opened[-1].put(shelf()["lamp"])
         return bench
 
     monkeypatch.setattr(SimBenchKind, "open", open_without)
