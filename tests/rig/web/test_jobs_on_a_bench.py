@@ -183,7 +183,7 @@ def stops_of(served: Served, number: int) -> list[dict[str, Any]]:
 
 
 def test_job_that_meets_an_interrupted_enrollment_offers_to_continue_it(serve):
-    served = serve()
+    served = serve("bench.sim.object='lamp'")
     worker = served.worker
     publish = worker.publish
 
@@ -251,7 +251,7 @@ def test_calibration_runs_as_a_job(serve):
 
 
 def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(serve, tmp_path):
-    served = serve()
+    served = serve("bench.sim.object='lamp'")
     assert served.run(kind="enroll", name="lamp", views=6)["state"] == "done"
     # A kill -9 leaves the stored jobs as they were in the middle of the work.
     file = tmp_path / "state" / "sim" / "web" / "jobs.json"
@@ -259,7 +259,7 @@ def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(ser
     jobs[0] |= {"state": "running", "ended_utc": None, "result": None, "views": 3}
     served.worker.end()
     file.write_text(json.dumps(jobs))
-    again = serve()
+    again = serve("bench.sim.object='lamp'")
     (job,) = again.client.get("/api/v1/jobs").json()["items"]
     assert job["state"] == "interrupted"
     assert job["resume"]["resume"]
@@ -272,7 +272,7 @@ async def first_event(stream):
 
 
 def test_events_continue_after_the_last_one_that_was_received(serve):
-    served = serve()
+    served = serve("bench.sim.object='lamp'")
     threads = threading.active_count()
     start = asyncio.run(first_event(served.server.hub.stream())).split()[1]
     served.run(kind="enroll", name="lamp", views=4)
