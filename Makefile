@@ -15,7 +15,7 @@ LIBRARY := hbr/kernels/_kernels.so
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
 	@echo "make web    show the simulated bench in a browser"
-	@echo "make test   run the tests (two to four minutes on two idle cores)"
+	@echo "make test   run the tests (three minutes on two idle cores)"
 	@echo "make test-nightly  run all tests and those of make fuzz, with many more cases in each (20 to 60 minutes on two cores)"
 	@echo "make test-kills  kill the program at a hundred points of its work, and check the stored data"
 	@echo "make test-web   test the pages in a real browser, and attack the server"

@@ -66,6 +66,7 @@ def test_loop_writes_an_error_as_its_last_line(tmp_path):
     assert json.loads(done.stdout.splitlines()[-1])["next_step"]
 
 
+@pytest.mark.nightly  # the golden sessions run every strategy of the rig
 def test_custom_strategies_find_the_same_objects_as_the_default(tmp_path):
     done = run(str(EXAMPLES / "custom_strategy.py"), cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -29,6 +29,7 @@ def serving(tmp_path: Path) -> Iterator[Callable[..., str]]:
         process.close()
 
 
+@pytest.mark.nightly
 def test_rustypot_drives_an_xl430(serving: Callable[..., str]) -> None:
     rustypot = pytest.importorskip("rustypot")
     port = serving(1, 4)
