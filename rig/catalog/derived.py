@@ -7,11 +7,10 @@ missing, old or damaged result is computed again, so the table can be emptied at
 Decision: docs/decisions/0010.
 """
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import select
 
 import hbr
@@ -21,15 +20,22 @@ from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
-from rig.catalog.describing import describe_one, described, known_descriptor, records_of, store, stored_contents
+from rig.catalog.describing import (
+    describe_one,
+    described,
+    known_descriptor,
+    records_of,
+    segmented_again,
+    store,
+    stored_contents,
+)
 from rig.catalog.facts import Enrollment, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, finished, processes
 from rig.catalog.records import Region
-from rig.config import ViewConfig
-from rig.core.errors import CatalogDamaged, CatalogError, ObjectNotFound
+from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
-from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber, within
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR
 
 
 def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None, hbr.Views]:
@@ -105,45 +111,15 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     enrollment = catalog.object(name).complete
     if enrollment is None:
         return []
-    places = near([view.azimuth_deg for view in enrollment.views], azimuths_deg)
-    found = _segmented(catalog, enrollment, name, [int(place) for place in places])
-    return [LocalView(cut.crop, cut.mask, view.azimuth_deg) for view, cut in found]
-
-
-def silhouette(catalog: Catalog, name: str, index: int) -> NDArray[np.bool_]:
-    """Return the object's pixels in the region of one of its enrolled views, bool (height, width); errors as above.
-
-    ``index`` is the place of the view in the complete enrollment.
-    """
-    enrollment = catalog.object(name).complete
-    if enrollment is None or not 0 <= index < len(enrollment.views):
-        raise ObjectNotFound(f"{name!r} has no such view.", next_step=Do.LIST_OBJECTS())
-    ((view, cut),) = _segmented(catalog, enrollment, name, [index])
-    height, width = within(catalog.read_image(view.image), view.region).shape[:2]
-    return cut.frame_mask(width, height)
-
-
-def _segmented(
-    catalog: Catalog, enrollment: Enrollment, name: str, places: Sequence[int]
-) -> Iterator[tuple[View, hbr.Segmentation]]:
-    """Yield views of an enrollment by their places, segmented as at the enrollment."""
     evidence = described(catalog.database, enrollment, name, BENCH_DESCRIPTOR).segmentation
-    describers: dict[tuple[Region | None, str | None], ViewDescriber] = {}
-    for place in places:
+    cut_out = []
+    for place in near([view.azimuth_deg for view in enrollment.views], azimuths_deg):
         view = enrollment.views[place]
-        region, table = view.region, enrollment.sessions[view.session].empty_table
-        if (region, table) not in describers:  # it prepares the empty-table image
-            empty = None if table is None else catalog.read_image(table)
-            describers[region, table] = ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), empty)
-        try:
-            yield (
-                view,
-                describers[region, table].segment(catalog.read_image(view.image), view.azimuth_deg, evidence[place]),
-            )
-        except ValueError as error:
-            raise CatalogDamaged(
-                f"The view {view.id} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()
-            ) from error
+        with catalog.database.catalog_errors():
+            session = enrollment.sessions[view.session]
+            _, cut = segmented_again(catalog.database.images, view, session, evidence[place])
+        cut_out.append(LocalView(cut.crop, cut.mask, view.azimuth_deg))
+    return cut_out
 
 
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:

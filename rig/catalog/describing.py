@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -16,18 +17,27 @@ from numpy.typing import ArrayLike, NDArray
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session as Transaction
 
+import hbr
 from hbr.descriptors import Descriptor, descriptor, names
 from hbr.descriptors.network import PACKAGE
 from hbr.kernels.library import THREADS
 from rig.catalog.database import Database
-from rig.catalog.facts import Derived, Enrollment, seal_of
+from rig.catalog.facts import Derived, Enrollment, Session, View, seal_of
 from rig.catalog.images import Images
 from rig.catalog.opening import open_database
+from rig.catalog.records import JsonObject, Region
 from rig.config import ViewConfig
-from rig.core.errors import CatalogError, ExtraMissing, RigError, UsageError
+from rig.core.errors import CatalogDamaged, CatalogError, ExtraMissing, RigError, UsageError
 from rig.core.files import json_values
 from rig.core.next_steps import Do
-from rig.views.description import DESCRIPTORS, EnrollmentDescriber, check_evidence, within
+from rig.views.description import (
+    BENCH_DESCRIPTOR,
+    DESCRIPTORS,
+    EnrollmentDescriber,
+    ViewDescriber,
+    check_evidence,
+    within,
+)
 
 SEGMENTATION: Final = "segmentation"
 """The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.segment`)."""
@@ -98,6 +108,45 @@ def described(
         found = _describe(reader(database.images.pixels, held), enrollment, name, kinds, threads=THREADS)
     store(database, seal, _contents(enrollment, found))
     return found
+
+
+# Segment again
+
+
+def segmented_again(
+    images: Images, view: View, session: Session, segmentation: JsonObject
+) -> tuple[Pixels, hbr.Segmentation]:
+    """Return the image of a stored view, and its object as the description cut it out.
+
+    Raises `CatalogDamaged`: the view cannot be segmented.
+    """
+    image = images.pixels(view.image)
+    try:
+        return image, _describer(images, view.region, session.empty_table).segment(
+            image, view.azimuth_deg, segmentation
+        )
+    except ValueError as error:
+        raise CatalogDamaged(
+            f"The view {view.id} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()
+        ) from error
+
+
+def silhouette(
+    images: Images, view: View, session: Session, segmentation: JsonObject
+) -> tuple[NDArray[np.bool_], hbr.Segmentation]:
+    """Return the object's pixels in the image of a view, and where it was found; none if it was not."""
+    image, found = segmented_again(images, view, session, segmentation)
+    whole = np.zeros(image.shape[:2], np.bool_)
+    part = within(whole, view.region)
+    part[:] = found.frame_mask(*part.shape[::-1])
+    return whole, found
+
+
+@lru_cache(maxsize=4)
+def _describer(images: Images, region: Region | None, empty_table: str | None) -> ViewDescriber:
+    """Return what segments the views of a session; to prepare its empty-table image takes long."""
+    table = None if empty_table is None else images.pixels(empty_table)
+    return ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), table)
 
 
 # Compute

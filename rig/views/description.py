@@ -6,7 +6,7 @@ Decision: docs/decisions/0010.
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from rig.core.errors import UsageError
 from rig.views.table_problems import TableProblem, TableProblemCode
 from rig.views.table_sheet import TableSheet, table_image
 
+Value = TypeVar("Value", bound=np.generic)
 PAPER_DESCRIPTOR: Final = "cedd"
 """The paper's descriptor. It describes the whole region of interest, with the background."""
 BENCH_DESCRIPTOR: Final = best()
@@ -79,8 +80,8 @@ class DescribedView:
     other_bench: bool = False
 
 
-def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
-    """Return a region of an image, uint8 (h, w, 3); the whole image if the region is None.
+def within(image_bgr: NDArray[Value], region: tuple[int, int, int, int] | None) -> NDArray[Value]:
+    """Return the view of a region of an image (H, W, ...), or of a mask; the whole image if the region is None.
 
     Raises `UsageError`: the region does not lie within the image.
     """

@@ -8,7 +8,8 @@ from pydantic import BaseModel
 from hbr.core.angles import wrap180
 from hbr.model.symmetry import extreme_pairs
 from rig.catalog import Catalog, View
-from rig.catalog.derived import silhouette, views
+from rig.catalog.derived import views
+from rig.catalog.describing import described, silhouette
 from rig.core.errors import JobNotFound
 from rig.views.description import BENCH_DESCRIPTOR, within
 from rig.web.answers import Jpeg
@@ -71,8 +72,14 @@ def add_pictures(routes: Routes, server: Server) -> None:
     @routes.watch.get("/silhouette", tags=["catalog"])
     def get_silhouette(object_name: Object, index: Annotated[int, Query(ge=0, lt=10_000)]) -> Silhouette:
         """Return the silhouette of an object in one of its views, as the description uses it; ``index`` from 0."""
-        with server.catalog.open_to_read() as catalog:
-            mask = silhouette(catalog, object_name, index)
+        with server.catalog.open_to_read() as catalog, catalog.database.catalog_errors():
+            enrollment = catalog.object(object_name).complete
+            if enrollment is None or index >= len(enrollment.views):
+                raise JobNotFound(f"{object_name!r} has no such view.", next_step="Choose one of GET /api/v1/objects.")
+            view = enrollment.views[index]
+            evidence = described(catalog.database, enrollment, object_name, BENCH_DESCRIPTOR).segmentation[index]
+            whole, _ = silhouette(catalog.database.images, view, enrollment.sessions[view.session], evidence)
+        mask = within(whole, view.region)
         height, width = mask.shape
         return Silhouette(width=width, height=height, points=outlines_of(mask))
 

@@ -19,12 +19,12 @@ from zlib import crc32
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rig.calibrations import CalibrationResult
 from rig.calibrations.store import CALIBRATIONS
-from rig.catalog.describing import described
+from rig.catalog.describing import described, silhouette
 from rig.catalog.exchange.new_files import new_folder
-from rig.catalog.exchange.training import silhouette
 from rig.catalog.facts import Session, View
 from rig.catalog.transfer import CatalogSource
 from rig.core.errors import ExportFailed
@@ -82,7 +82,7 @@ def write_scan(folder: Path, source: CatalogSource, form: ScanFormat, results: I
             camera = _camera(session, known, item.name)
             mask, _ = silhouette(images, view, session, found)
             if not mask.any():  # no object was found: the whole region may show it
-                within(mask, view.region)[:] = True  # type: ignore[arg-type] # a view of it
+                within(mask, view.region)[:] = True
             if camera.size != mask.shape[::-1]:
                 raise ExportFailed(
                     f"View {view.index} has {mask.shape[1]} × {mask.shape[0]} pixels, but the camera was calibrated "
@@ -160,20 +160,13 @@ def _write_colmap(folder: Path, posed: list[_Posed]) -> None:
     cameras: dict[tuple[Any, ...], int] = {}
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then its points, of which there are none"]
     for number, one in enumerate(posed, 1):
+        x, y, z, w = Rotation.from_matrix(one.pose[:3, :3]).as_quat()
         camera = cameras.setdefault((*one.size, *_colmap_lens(one)), len(cameras) + 1)
-        pose = " ".join(f"{value:.12g}" for value in (*_quaternion(one.pose[:3, :3]), *one.pose[:3, 3]))
+        pose = " ".join(f"{value:.12g}" for value in (w, x, y, z, *one.pose[:3, 3]))
         images += [f"{number} {pose} {camera} {one.name}", ""]
     known = [f"{camera} OPENCV {' '.join(f'{v:.12g}' for v in values)}" for values, camera in cameras.items()]
     for name, lines in (("cameras", known), ("images", images), ("points3D", [])):
         (folder / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> list[float]:
-    """Return w, x, y, z of a rotation."""
-    vector = cv2.Rodrigues(rotation)[0].ravel()
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle else vector
-    return [cos(angle / 2), *(sin(angle / 2) * axis).tolist()]
 
 
 def _transforms(posed: list[_Posed]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import json
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -17,21 +17,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.segmentation import BoxMethod, Segmentation
+from hbr.segmentation import BoxMethod
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import described
+from rig.catalog.describing import described, silhouette
 from rig.catalog.exchange.new_files import new_folder
 from rig.catalog.facts import Session, View
 from rig.catalog.images import Images, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.records import JsonObject, Region, this_software
+from rig.catalog.records import this_software
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
-from rig.config import ViewConfig
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import ExportFailed
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
-from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber, within
+from rig.views.description import within
 from rig.views.image_files import IMAGE_FOLDER
 
 PARTS: Final = ("train", "val", "test")
@@ -138,35 +137,17 @@ def _masks(folder: Path, portion: tuple[_Picture, ...]) -> list[_Mask]:
     return [_mask(images, picture) for picture in portion]
 
 
-def silhouette(
-    images: Images, view: View, session: Session, segmentation: JsonObject
-) -> tuple[NDArray[np.bool_], Segmentation]:
-    """Return the object's pixels in the image of a view, and where it was found; none if it was not."""
-    image = images.pixels(view.image)
-    found = _describer(images, view.region, session.empty_table).segment(image, view.azimuth_deg, segmentation)
-    whole = np.zeros(image.shape[:2], np.bool_)
-    part = within(whole, view.region)  # type: ignore[arg-type] # a view of it
-    part[:] = found.frame_mask(*part.shape[::-1])
-    return whole, found
-
-
 def _mask(images: Images, picture: _Picture) -> _Mask:
     whole, found = silhouette(images, picture.view, picture.session, json.loads(picture.segmentation))
     height, width = whole.shape
     x0, y0, *_ = picture.view.region or (0, 0)
     if found.box is None or not whole.any():
-        within(whole, picture.view.region)[:] = True  # type: ignore[arg-type]
+        within(whole, picture.view.region)[:] = True
         return _Mask(width, height, BoxMethod.NONE.value, None, _counts(whole), [])
     x, y, box_width, box_height = found.box
     polygon = [[px / width, py / height] for px, py in _outline(whole)]
     box = (x + x0, y + y0, box_width, box_height)
     return _Mask(width, height, found.method.value, box, _counts(whole), polygon)
-
-
-@lru_cache(maxsize=4)
-def _describer(images: Images, region: Region | None, empty_table: str | None) -> ViewDescriber:
-    table = None if empty_table is None else images.pixels(empty_table)
-    return ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), table)
 
 
 def _counts(mask: NDArray[np.bool_]) -> list[int]:
