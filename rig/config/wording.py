@@ -53,6 +53,12 @@ class KeyInfo:
     def name(self) -> str:
         return ".".join(self.key)
 
+    def value(self, values: Any) -> Any:
+        """Return the value of the key in a model or in nested mappings; None if these do not have it."""
+        for part in self.key:
+            values = values.get(part) if isinstance(values, Mapping) else getattr(values, part, None)
+        return values
+
 
 def key_info(model: type[BaseModel], above: Key = ()) -> Iterator[KeyInfo]:
     """Yield the keys of a model and of its sections, in order."""

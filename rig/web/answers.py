@@ -339,6 +339,44 @@ class Calibrations(BaseModel):
     unreadable: list[str]
 
 
+class Setting(BaseModel):
+    """A key of the configuration: ``value`` is in force, ``saved`` is that of the file; null if it has none.
+
+    ``editable`` says whether a page may change it.
+    """
+
+    key: str
+    value: Any
+    saved: Any
+    default: Any
+    allowed: str
+    unit: str
+    description: str
+    editable: bool
+
+
+class Settings(BaseModel):
+    """The keys of the configuration, and its ``file``, which pages change."""
+
+    keys: list[Setting]
+    file: str | None
+
+
+class SettingChange(BaseModel):
+    """The lines of the file that were changed: removed ones with ``-``, added ones with ``+``."""
+
+    changed: list[str]
+
+
+class ShelfState(BaseModel):
+    """A simulated bench: the ``things`` on its shelf, the ``object`` on the table, its light and its faults."""
+
+    things: list[str]
+    object: str | None
+    light: float
+    faults: list[str]
+
+
 class RunCheck(BaseModel):
     """What a saved run gives when it is computed again: the ``differences`` in words, none if all is as saved."""
 

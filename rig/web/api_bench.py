@@ -24,6 +24,7 @@ from rig.web.answers import (
     Me,
     Move,
     OtherBench,
+    ShelfState,
     Status,
     Stopped,
     Svg,
@@ -248,17 +249,15 @@ def add_jobs(routes: Routes, server: Server) -> None:
 def add_shelf(routes: Routes, server: Server) -> None:
     """Add the routes for the hands at a simulated bench; other benches answer 404."""
 
-    @routes.watch.get("/shelf", tags=["bench"])
-    def get_shelf() -> dict[str, Any]:
+    @routes.watch.get("/shelf", tags=["bench"], response_model=ShelfState)
+    def get_shelf() -> Any:
         """Return the objects of a simulated bench, and what is on its table."""
-        state: dict[str, Any] = server.remote.call("shelf")
-        return state
+        return server.remote.call("shelf")
 
-    @routes.operate.post("/shelf", tags=["bench"])
-    def use_shelf(body: ByHand) -> dict[str, Any]:
+    @routes.operate.post("/shelf", tags=["bench"], response_model=ShelfState)
+    def use_shelf(body: ByHand) -> Any:
         """Do something by hand at a simulated bench; the event `shelf` says what was done."""
-        state: dict[str, Any] = server.remote.call("by_hand", words=body.words)
-        return state
+        return server.remote.call("by_hand", words=body.words)
 
     @routes.watch.get("/shelf/{name}", tags=["bench"], response_class=Jpeg)
     def get_thing(name: str) -> Jpeg:

@@ -1,7 +1,7 @@
 """The REST API: saved runs, calibrations and the configuration."""
 
 import re
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from fastapi import Response
 from fastapi.responses import HTMLResponse, JSONResponse
@@ -10,7 +10,7 @@ from pydantic import Field
 from rig.bench.changes import set_key
 from rig.calibrations import CalibrationStore
 from rig.config import RigConfig
-from rig.config.toml_file import NONE, Key, toml
+from rig.config.toml_file import NONE, toml
 from rig.config.values import read_values
 from rig.config.wording import key_info
 from rig.core.errors import ConfigError, Forbidden, JobNotFound, UsageError
@@ -20,7 +20,17 @@ from rig.core.next_steps import Do
 from rig.events.events import event_dict
 from rig.search.replay import ReplayCheck, check
 from rig.search.saved_run import SavedRun, load_run
-from rig.web.answers import CalibrationRow, Calibrations, ListOf, RunCheck, RunName, SavedRunBody
+from rig.web.answers import (
+    CalibrationRow,
+    Calibrations,
+    ListOf,
+    RunCheck,
+    RunName,
+    SavedRunBody,
+    Setting,
+    SettingChange,
+    Settings,
+)
 from rig.web.requests import SettingBody
 from rig.web.server import Page, Routes, Server, long_work
 from rig.web.work import calibrations
@@ -106,38 +116,39 @@ def add_records(routes: Routes, server: Server) -> None:
         return JSONResponse(masked(server.setup.config.model_dump(mode="json")))
 
     @routes.watch.get("/settings", tags=["bench"])
-    def list_settings() -> dict[str, Any]:
+    def list_settings() -> Settings:
         """Return the keys of the configuration: value in force, value in the file, default, range, unit, meaning."""
-        config, file = server.setup.config, server.setup.config_file
+        config, file = server.setup.config.model_dump(mode="json"), server.setup.config_file
         written = read_values(file).values if file is not None and file.exists() else {}
-        keys = []
-        for info in key_info(type(config)):
-            if info.name == "bench":
-                continue  # options of other benches
-            value = {"value": _at(config.model_dump(mode="json"), info.key), "saved": _at(written, info.key)}
-            about = {"allowed": info.allowed, "unit": info.unit, "description": info.description}
-            default = plain({"value": info.default})["value"]
-            editable = file is not None and info.key[0] in CHANGED_BY_PAGES and info.name not in NOT_BY_PAGES
-            keys.append(masked({"key": info.name, **value, "default": default, **about}) | {"editable": editable})
-        return {"keys": keys, "file": None if file is None else str(file)}
+        keys = [
+            Setting(
+                key=info.name,
+                **masked({"value": info.value(config), "saved": info.value(written), "default": plain(info.default)}),
+                allowed=info.allowed,
+                unit=info.unit,
+                description=info.description,
+                editable=file is not None and _is_for_pages(info.name),
+            )
+            for info in key_info(RigConfig)
+            if info.name != "bench"  # options of other benches
+        ]
+        return Settings(keys=keys, file=None if file is None else str(file))
 
     @routes.operate.put("/settings/{key}", tags=["bench"])
-    def change_setting(key: Annotated[str, Field(max_length=60)], body: SettingBody) -> dict[str, Any]:
+    def change_setting(key: Annotated[str, Field(max_length=60)], body: SettingBody) -> SettingChange:
         """Write a key into the configuration file; it is in force when the server starts again."""
         file = server.setup.config_file
-        if file is None or key.partition(".")[0] not in CHANGED_BY_PAGES or key in NOT_BY_PAGES:
+        if file is None or not _is_for_pages(key):
             raise Forbidden(
                 f"A page cannot change {key}.",
                 next_step=("At a terminal of the bench's computer:", Do.SET_KEY(key=key, value="VALUE")),
             )
         try:
-            return {"changed": set_key(file, key, NONE if body.value is None else toml(body.value))}
+            return SettingChange(changed=set_key(file, key, NONE if body.value is None else toml(body.value)))
         except ConfigError as error:  # of this request, not of the server
             raise UsageError(error.what, next_step=error.steps, evidence=error.evidence) from error
 
 
-def _at(values: Any, key: Key) -> Any:
-    """Return the value at a key of nested values; None if there is none."""
-    for part in key:
-        values = values.get(part) if isinstance(values, dict) else None
-    return values
+def _is_for_pages(key: str) -> bool:
+    """Return whether a page may change a key."""
+    return key.partition(".")[0] in CHANGED_BY_PAGES and key not in NOT_BY_PAGES

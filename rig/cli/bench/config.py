@@ -163,16 +163,10 @@ def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[
 
     for info in key_info(type(config)):
         if info.key != ("bench",):
-            yield info, _value(config, info.key)
+            yield info, info.value(config)
     for name, model in options.items():
         for info in key_info(type(model), ("bench", name)):
-            yield info, _value(model, info.key[2:])
-
-
-def _value(model: Any, key: tuple[str, ...]) -> Any:
-    for part in key:
-        model = model[part] if isinstance(model, dict) else getattr(model, part)
-    return model
+            yield info, info.value({"bench": options})
 
 
 def _unknown(wanted: str, names: list[str]) -> ConfigError:
