@@ -105,7 +105,7 @@ lock:
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
 	printf 'hatchling\neditables\n' | uv pip compile - pyproject.toml --constraint requirements.lock --universal --python-version 3.11 \
 	    --generate-hashes --no-header --no-emit-index-url -o .ci/core.lock
-	for tool in uv:uv setuptools:backend cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
+	for tool in uv:uv 'setuptools poetry-core:backend' cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
 	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
