@@ -105,7 +105,8 @@ def test_the_most_similar_segmentation_counts() -> None:
     several = hbr.update_belief(np.stack([other, levels[4]]), 0.0, index)
     alone = hbr.update_belief(levels[4], 0.0, index)
     assert several.ranking().object_index[0] == 1
-    assert several.scores()[1] == alone.scores()[1]
+    # the product of one row and that of two differ in the last digits of float32 on some processors
+    assert several.scores()[1] == pytest.approx(alone.scores()[1], abs=1e-6)
 
 
 def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
