@@ -1,24 +1,21 @@
 """Simulated faults of the camera, its lens, its cable and the light."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from math import pi, sin
 
 import numpy as np
 
 from sim.devices import SimDevices
-from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
+from sim.faults.kind import End, Parameter, Values, added, repeatedly, share, simulated_fault, switched
 from sim.frame_times import FPS
 from sim.objects.projection import Image
-
-Values = Mapping[str, float]
 
 
 def _filter(devices: SimDevices, change: Callable[[Image], Image]) -> End:
     def changed(image: Image, _frame: int) -> Image:
         return change(image)
 
-    devices.camera.filters.append(changed)
-    return lambda: devices.camera.filters.remove(changed)
+    return added(devices.camera.filters, changed)
 
 
 @simulated_fault("camera.off", "The camera is unplugged. After it is plugged in, it must be opened again.")
@@ -27,48 +24,30 @@ def _off(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End
     return devices.camera.replug
 
 
-@simulated_fault("camera.stuck", "The camera's stream hangs. No frame arrives.")
-def _stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
-    devices.camera.hangs = True
-    return lambda: setattr(devices.camera, "hangs", False)
-
-
-@simulated_fault("camera.garbage", "A bad cable corrupts the frames. They show noise.")
-def _garbage(devices: SimDevices, _values: Values, rng: np.random.Generator) -> End:
-    return _filter(devices, lambda image: rng.integers(0, 256, image.shape, dtype=np.uint8))
-
-
-@simulated_fault("camera.wrong", "The camera changes to a mode of half the size.")
-def _wrong(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
-    return _filter(devices, lambda image: np.ascontiguousarray(image[::2, ::2]))
-
-
-@simulated_fault("camera.slow", "The camera delivers few frames.", fps=Parameter(2.0, "frames per second", 0.1, FPS))
-def _slow(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.camera.every = max(round(FPS / values["fps"]), 1)
-    return lambda: setattr(devices.camera, "every", 1)
-
-
-@simulated_fault("camera.delayed", "Frames arrive late.", seconds=Parameter(0.4, "delay, s", 0, 10))
-def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.camera.latency_ns = round(values["seconds"] * 1e9)
-    return lambda: setattr(devices.camera, "latency_ns", 0)
-
-
-@simulated_fault("camera.intermittent", "The plug is loose. Some frames cannot be fetched.", rate=share(0.2, "frames"))
-def _intermittent(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
-    def fails() -> bool:
-        return bool(rng.random() < values["rate"])
-
-    devices.camera.grab_failures.append(fails)
-    return lambda: devices.camera.grab_failures.remove(fails)
+simulated_fault("camera.stuck", "The camera's stream hangs. No frame arrives.")(
+    lambda devices, _, __: switched(devices.camera, "hangs", True, False)
+)
+simulated_fault("camera.garbage", "A bad cable corrupts the frames. They show noise.")(
+    lambda devices, _, rng: _filter(devices, lambda image: rng.integers(0, 256, image.shape, dtype=np.uint8))
+)
+simulated_fault("camera.wrong", "The camera changes to a mode of half the size.")(
+    lambda devices, _, __: _filter(devices, lambda image: np.ascontiguousarray(image[::2, ::2]))
+)
+simulated_fault("camera.slow", "The camera delivers few frames.", fps=Parameter(2.0, "frames per second", 0.1, FPS))(
+    lambda devices, values, _: switched(devices.camera, "every", max(round(FPS / values["fps"]), 1), 1)
+)
+simulated_fault("camera.delayed", "Frames arrive late.", seconds=Parameter(0.4, "delay, s", 0, 10))(
+    lambda devices, values, _: switched(devices.camera, "latency_ns", round(values["seconds"] * 1e9), 0)
+)
+simulated_fault("camera.intermittent", "The plug is loose. Some frames cannot be fetched.", rate=share(0.2, "frames"))(
+    lambda devices, values, rng: added(devices.camera.grab_failures, lambda: bool(rng.random() < values["rate"]))
+)
 
 
 @simulated_fault("lost_frames", "The USB is overloaded. Some frames never arrive.", rate=share(0.3, "frames"))
 def _lost_frames(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
     times = devices.camera.times
-    before, times.lost_share = times.lost_share, min(values["rate"], 0.99)
-    return lambda: setattr(times, "lost_share", before)
+    return switched(times, "lost_share", min(values["rate"], 0.99), times.lost_share)
 
 
 @simulated_fault(
@@ -87,34 +66,17 @@ def _doubled(devices: SimDevices, values: Values, rng: np.random.Generator) -> E
     return _filter(devices, again)
 
 
-def _shifted_stamps(devices: SimDevices, ms: float) -> End:
-    devices.camera.stamp_shift_ns = round(ms * 1e6)
-    return lambda: setattr(devices.camera, "stamp_shift_ns", 0)
-
-
-@simulated_fault("stamp_jump", "The time stamps of the frames jump.", ms=Parameter(12.0, "jump, ms", -1000, 1000))
-def _stamp_jump(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    return _shifted_stamps(devices, values["ms"])
-
-
-@simulated_fault(
-    "stamps_backwards",
-    "The time stamps of the frames go backwards.",
-    ms=Parameter(80.0, "how far, ms", 0, 1000),
+simulated_fault("stamp_jump", "The time stamps of the frames jump.", ms=Parameter(12.0, "jump, ms", -1000, 1000))(
+    lambda devices, values, _: switched(devices.camera, "stamp_shift_ns", round(values["ms"] * 1e6), 0)
 )
-def _stamps_backwards(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    return _shifted_stamps(devices, -values["ms"])
-
-
-@simulated_fault(
+simulated_fault(
+    "stamps_backwards", "The time stamps of the frames go backwards.", ms=Parameter(80.0, "how far, ms", 0, 1000)
+)(lambda devices, values, _: switched(devices.camera, "stamp_shift_ns", round(-values["ms"] * 1e6), 0))
+simulated_fault(
     "stamp_jitter",
     "The computer stamps frames late because it is busy.",
     ms=Parameter(6.0, "1 σ of the error, ms", 0, 100),
-)
-def _stamp_jitter(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    times = devices.camera.times
-    times.stamped_late_ns = values["ms"] * 1e6
-    return lambda: setattr(times, "stamped_late_ns", 0.0)
+)(lambda devices, values, _: switched(devices.camera.times, "stamped_late_ns", values["ms"] * 1e6, 0.0))
 
 
 @simulated_fault("frozen_frame", "The camera repeats one image with new time stamps.")
@@ -128,15 +90,12 @@ def _frozen(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> 
     return _filter(devices, hold)
 
 
-@simulated_fault("black_frame", "The frames are black because of a lens cap or a broken lamp.")
-def _black(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
-    return _filter(devices, np.zeros_like)
-
-
-@simulated_fault("blur", "The lens is out of focus.", pixels=Parameter(8.0, "sigma of the blur, px", 0, 100))
-def _blur(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.camera.blur_px = values["pixels"]
-    return lambda: setattr(devices.camera, "blur_px", 0.0)
+simulated_fault("black_frame", "The frames are black because of a lens cap or a broken lamp.")(
+    lambda devices, _, __: _filter(devices, np.zeros_like)
+)
+simulated_fault("blur", "The lens is out of focus.", pixels=Parameter(8.0, "sigma of the blur, px", 0, 100))(
+    lambda devices, values, _: switched(devices.camera, "blur_px", values["pixels"], 0.0)
+)
 
 
 @simulated_fault(
@@ -173,12 +132,9 @@ def _light_flicker(devices: SimDevices, values: Values, _rng: np.random.Generato
     return restore
 
 
-@simulated_fault(
+simulated_fault(
     "mains_flicker",
     "The lamps flicker with the mains. Exposures that are not whole periods of the lamp show bands.",
     hz=Parameter(50.0, "frequency of the mains, Hz", 1, 400),
     depth=share(0.3, "the light that flickers"),
-)
-def _mains_flicker(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.camera.lamp = 2 * values["hz"], values["depth"]
-    return lambda: setattr(devices.camera, "lamp", None)
+)(lambda devices, values, _: switched(devices.camera, "lamp", (2 * values["hz"], values["depth"]), None))

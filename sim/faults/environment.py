@@ -2,16 +2,13 @@
 
 import errno
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from sim.devices import SimDevices
-from sim.faults.kind import End, Parameter, simulated_fault
-
-Values = Mapping[str, float]
-
+from sim.faults.kind import End, Parameter, Values, simulated_fault
 
 _os: Any = os
 
@@ -58,9 +55,7 @@ def _object_moved(devices: SimDevices, values: Values, rng: np.random.Generator)
     return lambda: world.put(before.object, before.yaw_deg, before.offset_mm)
 
 
-@simulated_fault("disk_full", "The computer's disk is full. Nothing can be stored.")
-def _disk_full(_parts: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
-    return fill_disk()
+simulated_fault("disk_full", "The computer's disk is full. Nothing can be stored.")(lambda _, __, ___: fill_disk())
 
 
 @simulated_fault(

@@ -1,21 +1,12 @@
 """Simulated faults of the gyro on the platter and of its I2C bus."""
 
-from collections.abc import Callable, Mapping
-
 import numpy as np
 
 from rig.devices.i2c import DESIGNWARE
 from sim.devices import SimDevices
-from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
+from sim.faults.kind import End, Parameter, Values, added, repeatedly, share, simulated_fault, switched
 from sim.i2c import SimI2cBus
 from sim.imu.inertial import Words
-
-Values = Mapping[str, float]
-
-
-def _distort(devices: SimDevices, change: Callable[[Words], Words]) -> End:
-    devices.imu.distortions.append(change)
-    return lambda: devices.imu.distortions.remove(change)
 
 
 @simulated_fault("imu.off", "The gyro is unplugged. After it is plugged in, its settings are lost.")
@@ -38,12 +29,14 @@ def _stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> E
         samples.append(words[:1])
         return np.repeat(samples[0], len(words), axis=0)
 
-    return _distort(devices, hold)
+    return added(devices.imu.distortions, hold)
 
 
-@simulated_fault("imu.garbage", "The gyro delivers random samples.")
-def _garbage(devices: SimDevices, _values: Values, rng: np.random.Generator) -> End:
-    return _distort(devices, lambda words: rng.integers(-32768, 32768, words.shape).astype(">i2"))
+simulated_fault("imu.garbage", "The gyro delivers random samples.")(
+    lambda devices, _, rng: added(
+        devices.imu.distortions, lambda words: rng.integers(-32768, 32768, words.shape).astype(">i2")
+    )
+)
 
 
 @simulated_fault(
@@ -77,16 +70,14 @@ def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> 
         waiting[0] = queue[len(words) :]
         return queue[: len(words)]
 
-    return _distort(devices, delay)
+    return added(devices.imu.distortions, delay)
 
 
-@simulated_fault(
+simulated_fault(
     "imu.intermittent",
     "A contact is loose. The gyro loses its supply and its settings again and again.",
     period=Parameter(2.0, "time between losses, s", 0.01, 1000),
-)
-def _intermittent(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    return repeatedly(devices.world.clock, values["period"], devices.imu.power_cycle)
+)(lambda devices, values, _: repeatedly(devices.world.clock, values["period"], devices.imu.power_cycle))
 
 
 @simulated_fault(
@@ -105,23 +96,15 @@ def _bursts(devices: SimDevices, values: Values, rng: np.random.Generator) -> En
             awake[:] = begins, begins + 5_000_000
         return max(time_ns, awake[0])
 
-    devices.i2c.held = held
-    return lambda: setattr(devices.i2c, "held", int)
+    return switched(devices.i2c, "held", held, int)
 
 
-@simulated_fault("i2c_nack", "The cable is long. Some transfers are not acknowledged.", rate=share(0.02, "transfers"))
-def _nack(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
-    def nacks(_address: int) -> bool:
-        return bool(rng.random() < values["rate"])
-
-    devices.i2c.nack_conditions.append(nacks)
-    return lambda: devices.i2c.nack_conditions.remove(nacks)
-
-
-@simulated_fault("i2c_stuck", "A wire of the I2C bus is held low. No transfer is possible.")
-def _i2c_stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
-    devices.i2c.stuck = True
-    return lambda: setattr(devices.i2c, "stuck", False)
+simulated_fault("i2c_nack", "The cable is long. Some transfers are not acknowledged.", rate=share(0.02, "transfers"))(
+    lambda devices, values, rng: added(devices.i2c.nack_conditions, lambda _: bool(rng.random() < values["rate"]))
+)
+simulated_fault("i2c_stuck", "A wire of the I2C bus is held low. No transfer is possible.")(
+    lambda devices, _, __: switched(devices.i2c, "stuck", True, False)
+)
 
 
 @simulated_fault("i2c_hang", "The computer's I2C controller hangs, as that of a Raspberry Pi 5 can. No transfer ends.")
@@ -143,4 +126,4 @@ def _saturated(devices: SimDevices, _values: Values, _rng: np.random.Generator) 
         words[:, 4:] = 32767
         return words
 
-    return _distort(devices, clip)
+    return added(devices.imu.distortions, clip)

@@ -6,6 +6,7 @@ Decision: docs/decisions/0001.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from sim.clock import VirtualClock
 from sim.devices import SimDevices
 
 DEVICES = ("servo", "imu", "camera")
+F = TypeVar("F")
+Values = Mapping[str, float]
 
 End = Callable[[], None]
 """A function that removes the cause of a fault; its consequences remain."""
@@ -34,7 +37,7 @@ def share(default: float, of: str) -> Parameter:
     return Parameter(default, f"share of {of}", 0.0, 1.0)
 
 
-Begin = Callable[[SimDevices, Mapping[str, float], np.random.Generator], End]
+Begin = Callable[[SimDevices, Values, np.random.Generator], End]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +77,25 @@ registry: dict[str, FaultKind] = {}
 
 
 def simulated_fault(name: str, what: str, **parameters: Parameter) -> Callable[[Begin], Begin]:
-    """Register a function as the beginning of the fault ``name``."""
+    """Register a function as the beginning of the fault ``name``: a decorator, or called with a lambda."""
 
     def register(begin: Begin) -> Begin:
         registry[name] = FaultKind(name, what, MappingProxyType(parameters), begin)
         return begin
 
     return register
+
+
+def switched(thing: object, attribute: str, value: object, back: object) -> End:
+    """Set an attribute; return the function that sets it ``back``."""
+    setattr(thing, attribute, value)
+    return lambda: setattr(thing, attribute, back)
+
+
+def added(functions: list[F], function: F) -> End:
+    """Add a function to those that a device calls; return the function that removes it."""
+    functions.append(function)
+    return lambda: functions.remove(function)
 
 
 def repeatedly(clock: VirtualClock, period_s: float, action: Callable[[], None]) -> End:

@@ -1,34 +1,21 @@
 """Simulated faults of the servo, its gears and its bus."""
 
 from collections import deque
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from rig.core.clock import seconds_between
 from sim.devices import SimDevices
-from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
+from sim.faults.kind import End, Parameter, Values, added, repeatedly, share, simulated_fault, switched
 from sim.servo import SentBytes, SimServo
 from sim.servo.control_table import Memory
 from sim.servo.device import OVERLOAD_ERROR
 from sim.world import World
 
-Values = Mapping[str, float]
-
 LOWEST_SUPPLY_V = 4.5  # below this voltage the servo's controller resets. The e-manual states no value.
 _OTHER_MODEL = 1020  # model Number of an XM430-W350
 _XL430_MODEL = 1060
-
-
-def _filter(devices: SimDevices, change: Callable[[SentBytes], SentBytes | None]) -> End:
-    devices.servo_bus.filters.append(change)
-    return lambda: devices.servo_bus.filters.remove(change)
-
-
-def _distort(devices: SimDevices, change: Callable[[Memory], None]) -> End:
-    devices.servo.distortions.append(change)
-    return lambda: devices.servo.distortions.remove(change)
 
 
 def _later(frame: SentBytes, seconds: float) -> SentBytes:
@@ -52,12 +39,14 @@ def _stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> E
         readings.append(memory.live())
         memory.set_live(readings[0])
 
-    return _distort(devices, hold)
+    return added(devices.servo.distortions, hold)
 
 
-@simulated_fault("servo.garbage", "The servo's status registers contain random bytes, with a valid CRC.")
-def _garbage(devices: SimDevices, _values: Values, rng: np.random.Generator) -> End:
-    return _distort(devices, lambda memory: memory.set_live(rng.bytes(len(memory.live()))))
+simulated_fault("servo.garbage", "The servo's status registers contain random bytes, with a valid CRC.")(
+    lambda devices, _, rng: added(
+        devices.servo.distortions, lambda memory: memory.set_live(rng.bytes(len(memory.live())))
+    )
+)
 
 
 @simulated_fault(
@@ -70,13 +59,11 @@ def _wrong(devices: SimDevices, values: Values, _rng: np.random.Generator) -> En
     return lambda: None
 
 
-@simulated_fault(
+simulated_fault(
     "servo.slow",
     "Each answer is late but within the timeout, as with a USB latency timer of 16 ms.",
     seconds=Parameter(0.01, "delay, s", 0, 10),
-)
-def _slow(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    return _filter(devices, lambda frame: _later(frame, values["seconds"]))
+)(lambda devices, values, _: added(devices.servo_bus.filters, lambda frame: _later(frame, values["seconds"])))
 
 
 @simulated_fault(
@@ -92,12 +79,14 @@ def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> 
             readings.popleft()
         memory.set_live(readings[0][1])
 
-    return _distort(devices, age)
+    return added(devices.servo.distortions, age)
 
 
-@simulated_fault("servo.intermittent", "A contact is loose. Some answers are lost.", rate=share(0.05, "answers"))
-def _intermittent(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
-    return _filter(devices, lambda frame: None if rng.random() < values["rate"] else frame)
+simulated_fault("servo.intermittent", "A contact is loose. Some answers are lost.", rate=share(0.05, "answers"))(
+    lambda devices, values, rng: added(
+        devices.servo_bus.filters, lambda frame: None if rng.random() < values["rate"] else frame
+    )
+)
 
 
 # -- its bus ----------------------------------------------------------------------------------------------------------
@@ -112,7 +101,7 @@ def _crc_flip(devices: SimDevices, values: Values, rng: np.random.Generator) -> 
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
         return replace(frame, data=bytes(data))
 
-    return _filter(devices, flip)
+    return added(devices.servo_bus.filters, flip)
 
 
 @simulated_fault(
@@ -122,7 +111,10 @@ def _crc_flip(devices: SimDevices, values: Values, rng: np.random.Generator) -> 
     seconds=Parameter(0.05, "delay, s", 0, 10),
 )
 def _late_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
-    return _filter(devices, lambda frame: _later(frame, values["seconds"]) if rng.random() < values["rate"] else frame)
+    return added(
+        devices.servo_bus.filters,
+        lambda frame: _later(frame, values["seconds"]) if rng.random() < values["rate"] else frame,
+    )
 
 
 @simulated_fault(
@@ -140,7 +132,7 @@ def _duplicate_reply(devices: SimDevices, values: Values, rng: np.random.Generat
             clock.call_at(max(at_ns, clock.now_ns()), lambda: bus.disturb(frame.data, frame.baudrate))
         return frame
 
-    return _filter(devices, repeat)
+    return added(devices.servo_bus.filters, repeat)
 
 
 @simulated_fault(
@@ -153,10 +145,9 @@ def _babble(devices: SimDevices, values: Values, rng: np.random.Generator) -> En
     return repeatedly(devices.world.clock, values["period"], lambda: bus.disturb(rng.bytes(8), adapter.baudrate))
 
 
-@simulated_fault("echo", "The adapter receives its own bytes.")
-def _echo(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
-    devices.servo_bus.echo = True
-    return lambda: setattr(devices.servo_bus, "echo", False)
+simulated_fault("echo", "The adapter receives its own bytes.")(
+    lambda devices, _, __: switched(devices.servo_bus, "echo", True, False)
+)
 
 
 @simulated_fault("unplug", "The servo's USB adapter is unplugged. After it is plugged in, it must be opened again.")
