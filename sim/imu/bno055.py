@@ -7,13 +7,12 @@ self test, low-power modes, UART, and stretching of the clock. The fusion is the
 vertical, with a constant tilt. It measures its bias at rest, like the device.
 """
 
-from collections.abc import Callable
 from math import cos, pi, radians, sin
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.imu.inertial import InertialModel, Words
+from sim.imu.inertial import SimulatedImu, Words
 from sim.motion import Floats
 from sim.world import World
 
@@ -53,44 +52,27 @@ _ONLY_IN_CONFIG = frozenset({UNIT_SEL, PWR_MODE})
 _G = 9.80665  # BST-BNO055-DS000, 3.6.1: 100 LSB for 1 m/s²
 
 
-class SimBno055:
-    """The sensor on the platter; an `sim.i2c.I2cDevice`.
+class SimBno055(SimulatedImu):
+    """The sensor, whose fusion uses the words of the distortions.
 
-    Interface to the world: `inertial` (bias, gain and vertical of this part), `yaw_deg` (the rotation that its fusion
-    has measured up to the last reading), `temperature_c`, `chip_id`, `power_cycle`, `run_clock`, `fail` (the fusion
-    stops with an error), and `distortions`: each receives words like those of the MPU-6050, int16 (n, 7), and returns
-    those that the fusion uses.
+    `yaw_deg` is the rotation that its fusion has measured up to the last reading.
     """
 
+    GYRO_NOISIER = GYRO_NOISIER
+
     def __init__(self, world: World, *, address: int = 0x28, chip_id: int = 0xA0) -> None:
-        self.address = address
-        self.inertial = InertialModel(world, f"imu-{self.address:02x}", gyro_noisier=GYRO_NOISIER)
-        self.inertial.gyro_bias_dps *= GYRO_TRUER
-        self.temperature_c = 25.0
         self.chip_id = chip_id
-        self.clock_error = 0.0
-        self.distortions: list[Callable[[Words], Words]] = []
-        self._clock = world.clock
-        self.power_cycle()
+        super().__init__(world, address)
+        self.inertial.gyro_bias_dps *= GYRO_TRUER
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of the world's clock."""
         return 1e9 / self._tick_ns
 
-    def run_clock(self, error: float) -> None:
-        """Set the relative error of its clock."""
-        self._catch_up()
-        self.clock_error = error
-        self._epoch_ns, self._ticks = self._clock.now_ns(), 0
-        self.inertial.restart()
-
     def power_cycle(self) -> None:
-        """Lose all registers, as after a brown-out or a reset."""
-        self._registers = bytearray(0x80)
+        super().power_cycle()
         self._registers[UNIT_SEL] = 0x80
         self._silent_until_ns = self._clock.now_ns() + round(SILENT_S * 1e9)
-        self._pointer, self._pointed = 0, True
         self._switching_until_ns = 0
         self.yaw_deg = 0.0
         self._bias_dps: Floats = np.zeros(3)
@@ -111,29 +93,6 @@ class SimBno055:
 
     stretches = True
     """It holds SCL low while it prepares an answer (BST-BNO055-DS000, 4.6)."""
-
-    def start(self, reading: bool) -> None:
-        self._pointed = reading
-
-    def write(self, data: bytes) -> int:
-        acknowledged = len(data)
-        if data and not self._pointed:
-            self._pointer, self._pointed = data[0] & 0x7F, True
-            data = data[1:]
-        for byte in data:
-            self._set(self._pointer, byte)
-            self._pointer = (self._pointer + 1) & 0x7F
-        return acknowledged
-
-    def read(self, count: int) -> bytes:
-        self._catch_up()
-        answer = bytearray()
-        for _ in range(count):
-            answer.append(self._get(self._pointer))
-            self._pointer = (self._pointer + 1) & 0x7F
-        return bytes(answer)
-
-    def stop(self) -> None: ...
 
     def _get(self, register: int) -> int:
         if register == CHIP_ID:
@@ -163,22 +122,19 @@ class SimBno055:
         self._registers[ACC_DATA:TEMP] = bytes(TEMP - ACC_DATA)
         self._registers[CALIB_STAT] = 0
         self._registers[SYS_STATUS], self._registers[SYS_ERR] = IDLE, 0
-        self._epoch_ns = max(self._clock.now_ns(), self._switching_until_ns, self._silent_until_ns)
-        self._ticks = 0
         self._recent = np.empty((0, 3))
         self._bias_dps = np.zeros(3)
-        self.inertial.restart()
+        self._sample_from(max(self._clock.now_ns(), self._switching_until_ns, self._silent_until_ns))
 
     def _catch_up(self) -> None:
-        """Take the samples that are due since the last call."""
         registers, now_ns = self._registers, self._clock.now_ns()
         if registers[OPR_MODE] not in FUSION_MODES or registers[SYS_STATUS] == SYSTEM_ERROR:
             return
         due = (now_ns - self._epoch_ns) // self._tick_ns
-        if due <= self._ticks:
+        if due <= self._taken:
             return
-        times: NDArray[np.int64] = self._epoch_ns + self._tick_ns * np.arange(self._ticks + 1, due + 1)
-        self._ticks = due
+        times: NDArray[np.int64] = self._epoch_ns + self._tick_ns * np.arange(self._taken + 1, due + 1)
+        self._taken = due
         gyro, accel = self._distorted(*self.inertial.sample(times, 1e9 / TICK_NS, GYRO_BANDWIDTH_HZ))
         up = self.inertial.up
         begun = due - len(gyro)

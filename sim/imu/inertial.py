@@ -1,14 +1,14 @@
 """The signals of an inertial sensor on the platter and their errors, for any chip."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from functools import cache
 from math import cos, inf, pi, radians, sin, sqrt, tan
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.i2c import I2cDevice
 from sim.motion import Floats
 from sim.world import World
 
@@ -165,23 +165,96 @@ def _steps(before: float, values: NDArray[np.int64] | Floats) -> Floats:
     return steps
 
 
-class SimulatedImu(I2cDevice, Protocol):
-    """The interface of a sensor to the simulated bench and its faults, besides its interface to the bus.
+class SimulatedImu:
+    """A sensor on the platter with numbered registers; an `sim.i2c.I2cDevice`.
 
-    Each of ``distortions`` receives the words of samples, int16 (n, 7): accelerometer x, y, z, temperature, gyro x, y,
-    z. It returns the words that the sensor delivers.
+    Interface to the bench and its faults, besides that to the bus:
+
+    Attributes
+    ----------
+    inertial
+        Bias, gain, vertical and warming of this part.
+    temperature_c
+        Temperature of its surroundings.
+    clock_error
+        Relative error of its clock, positive if it is fast; set it before the sensor wakes, or by `run_clock`.
+    distortions
+        Each receives the words of samples, int16 (n, 7): accelerometer x, y, z, temperature, gyro x, y, z. It returns
+        the words that the sensor delivers.
     """
 
-    address: int
-    inertial: InertialModel
-    distortions: list[Callable[[Words], Words]]
+    GYRO_NOISIER: ClassVar[float] = 1.0
+    """Ratio of its gyro's noise to that of the bench's noise model."""
+    STAYS: ClassVar[int | None] = None
+    """The register after which the next one is the same."""
+
+    def __init__(self, world: World, address: int) -> None:
+        self.address = address
+        self.inertial = InertialModel(world, f"imu-{address:02x}", gyro_noisier=self.GYRO_NOISIER)
+        self.temperature_c = 25.0
+        self.clock_error = 0.0
+        self.distortions: list[Callable[[Words], Words]] = []
+        self._clock = world.clock
+        self.power_cycle()
 
     @property
+    @abstractmethod
     def rate_hz(self) -> float:
         """Samples per second of the world's clock."""
 
+    def power_cycle(self) -> None:
+        """Lose all registers, as after a brown-out or a reset."""
+        self._registers = bytearray(0x80)
+        self._pointer, self._pointed = 0, True
+
     def run_clock(self, error: float) -> None:
         """Set the relative error of its clock."""
+        self._catch_up()
+        self.clock_error = error
+        self._sample_from(self._clock.now_ns())
 
-    def power_cycle(self) -> None:
-        """Lose all registers, as after a brown-out."""
+    # -- bus side -----------------------------------------------------------------------------------------------------
+
+    def start(self, reading: bool) -> None:
+        self._pointed = reading  # a write starts with the register's number, a read continues at the pointer
+
+    def write(self, data: bytes) -> int:
+        acknowledged = len(data)
+        if data and not self._pointed:
+            self._pointer, self._pointed = data[0] & 0x7F, True
+            data = data[1:]
+        for byte in data:
+            self._set(self._pointer, byte)
+            self._advance()
+        return acknowledged
+
+    def read(self, count: int) -> bytes:
+        self._catch_up()
+        answer = bytearray()
+        for _ in range(count):
+            answer.append(self._get(self._pointer))
+            self._advance()
+        return bytes(answer)
+
+    def stop(self) -> None: ...
+
+    def _advance(self) -> None:
+        if self._pointer != self.STAYS:
+            self._pointer = (self._pointer + 1) & 0x7F
+
+    @abstractmethod
+    def _get(self, register: int) -> int: ...
+
+    @abstractmethod
+    def _set(self, register: int, value: int) -> None: ...
+
+    # -- sampling -----------------------------------------------------------------------------------------------------
+
+    def _sample_from(self, time_ns: int) -> None:
+        """Take the samples of the present settings from a time on."""
+        self._epoch_ns, self._taken = time_ns, 0
+        self.inertial.restart()
+
+    @abstractmethod
+    def _catch_up(self) -> None:
+        """Take the samples that are due since the last call."""

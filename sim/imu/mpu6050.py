@@ -10,12 +10,11 @@ low-pass and the separate low-pass of the accelerometer (MPU-6500); the magnetom
 second order, and the accelerometer has the gyro's rate and bandwidth.
 """
 
-from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
 
-from sim.imu.inertial import InertialModel, Words
+from sim.imu.inertial import SimulatedImu, Words
 from sim.motion import Floats
 from sim.world import World
 
@@ -50,14 +49,8 @@ _SAMPLING = {SMPLRT_DIV, CONFIG, PWR_MGMT_1}
 _FIFO_BITS = (0x08, 0x08, 0x08, 0x80, 0x40, 0x20, 0x10)
 
 
-class SimMpu6050:
-    """The sensor on the platter; an `sim.i2c.I2cDevice`.
-
-    Interface to the world: `inertial` (bias, gain, vertical and warming of this part), `temperature_c` (of its
-    surroundings), `clock_error` (relative error of its clock, positive if it is fast; set it before the sensor wakes,
-    or by `run_clock`), `who_am_i` (other for a clone), `power_cycle`, and `distortions`: each receives the samples'
-    words, int16 (n, 7), and returns those that are stored.
-    """
+class SimMpu6050(SimulatedImu):
+    """The sensor; ``who_am_i`` is another one for a clone."""
 
     IDENTITY: ClassVar[int] = 0x68
     FIFO_SIZE: ClassVar[int] = 1024  # bytes
@@ -68,42 +61,25 @@ class SimMpu6050:
     ZERO_C: ClassVar[float] = 36.53
     SELF_TEST_DPS: ClassVar[tuple[float, float, float]] = (58.0, -58.0, 58.0)
     """Change of the gyro's reading during its self-test (PS 6.1, RM 4.1: 25 to 101 °/s by the factory trim)."""
-    GYRO_NOISIER: ClassVar[float] = 1.0
-    """Ratio of its gyro's noise to that of the bench's noise model."""
+    STAYS = FIFO_R_W
 
     def __init__(self, world: World, *, address: int = 0x68, who_am_i: int | None = None) -> None:
-        self.address = address
-        self.inertial = InertialModel(world, f"imu-{self.address:02x}", gyro_noisier=self.GYRO_NOISIER)
-        self.temperature_c = 25.0
-        self.clock_error = 0.0
         self.who_am_i = self.IDENTITY if who_am_i is None else who_am_i
         self.self_test_dps = np.array(self.SELF_TEST_DPS)
-        self.distortions: list[Callable[[Words], Words]] = []
-        self._clock = world.clock
-        self.power_cycle()
+        super().__init__(world, address)
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of the world's clock."""
         registers = self._registers
         internal_hz = 8000 if registers[CONFIG] & 0x07 in (0, 7) else 1000
         return internal_hz / (1 + registers[SMPLRT_DIV]) * (1 + self.clock_error)
 
-    def run_clock(self, error: float) -> None:
-        """Set the relative error of its clock."""
-        self._take_samples()
-        self.clock_error = error
-        self._begin_sampling()
-
     def power_cycle(self) -> None:
-        """Lose all registers, as after a brown-out or DEVICE_RESET."""
-        self._registers = bytearray(0x80)
+        super().power_cycle()
         self._registers[PWR_MGMT_1] = self.AFTER_RESET
         self._fifo = bytearray()
         self._last_popped = 0
-        self._pointer = 0
-        self._pointed = True
-        self._begin_sampling()
+        self._sample_from(self._clock.now_ns())
 
     def next_edge_ns(self, after_ns: int) -> int | None:
         """Return the time of the interrupt pin's next edge after ``after_ns``: at each sample, if enabled."""
@@ -114,23 +90,10 @@ class SimMpu6050:
 
     # -- bus side -------------------------------------------------------------------------------------------------
 
-    def start(self, reading: bool) -> None:
-        self._pointed = reading  # a write starts with the register's number, a read continues at the pointer
-
-    def write(self, data: bytes) -> int:
-        acknowledged = len(data)
-        if data and not self._pointed:
-            self._pointer, self._pointed = data[0] & 0x7F, True
-            data = data[1:]
-        for byte in data:
-            self._set(self._pointer, byte)
-            self._advance()
-        return acknowledged
-
     def read(self, count: int) -> bytes:
         # Once for each burst: its bytes belong to one sample. Those that wait in the FIFO need no later samples.
         if self._pointer != FIFO_R_W or count > len(self._fifo) or self._overflows():
-            self._take_samples()
+            self._catch_up()
         answer = bytearray()
         while len(answer) < count:
             if self._pointer == FIFO_R_W:
@@ -139,12 +102,6 @@ class SimMpu6050:
                 answer.append(self._get(self._pointer))
                 self._advance()
         return bytes(answer)
-
-    def stop(self) -> None: ...
-
-    def _advance(self) -> None:
-        if self._pointer != FIFO_R_W:
-            self._pointer = (self._pointer + 1) & 0x7F
 
     def _get(self, register: int) -> int:
         if register == WHO_AM_I:
@@ -160,7 +117,7 @@ class SimMpu6050:
         if register == PWR_MGMT_1 and value & DEVICE_RESET:
             self.power_cycle()
             return
-        self._take_samples()  # with the settings before the write
+        self._catch_up()  # with the settings before the write
         changed = (self._registers[register] ^ value) & _WRITABLE.get(register, 0)
         self._registers[register] ^= changed
         if register == USER_CTRL:
@@ -169,7 +126,7 @@ class SimMpu6050:
             if value & SIG_COND_RESET:
                 self._registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = bytes(GYRO_ZOUT_L + 1 - ACCEL_XOUT_H)
         elif register in _SAMPLING and changed:
-            self._begin_sampling()
+            self._sample_from(self._clock.now_ns())
 
     def _pop(self, count: int) -> bytes:
         taken = bytes(self._fifo[:count])
@@ -178,11 +135,6 @@ class SimMpu6050:
         return taken.ljust(count, bytes([self._last_popped]))  # an empty FIFO repeats its last byte
 
     # -- sampling -------------------------------------------------------------------------------------------------
-
-    def _begin_sampling(self) -> None:
-        self._epoch_ns = self._clock.now_ns()
-        self._taken = 0
-        self.inertial.restart()
 
     def _internal_clock(self) -> tuple[int, int]:
         """Return the nominal rate (Hz) before the divider, and the true period (ns)."""
@@ -200,8 +152,7 @@ class SimMpu6050:
         """Return whether the samples that are due may not fit into the FIFO."""
         return len(self._fifo) + 2 * len(_FIFO_BITS) * (self._due() - self._taken) > self.FIFO_SIZE
 
-    def _take_samples(self) -> None:
-        """Take the samples that are due since the last call."""
+    def _catch_up(self) -> None:
         due = self._due()
         if due == self._taken:
             return
