@@ -116,18 +116,9 @@ class CameraModel(Procedure):
 def evaluate(
     views: Sequence[BoardView], board: CharucoBoard, size: tuple[int, int], found: Evaluation | None = None
 ) -> Evaluation:
-    """Fit the camera to ``views`` of the board.
+    """Fit the camera to ``views`` of the board, in the order in which they were taken, of frames of a ``size``.
 
-    Parameters
-    ----------
-    views
-        In the order in which they were taken.
-    board
-        Its layout.
-    size
-        Width and height of the frames.
-    found
-        Has the rejections found while the views were taken; it is completed and returned.
+    ``found`` has the rejections found while the views were taken; it is completed and returned.
     """
     found = found or Evaluation(name=NAME)
     found.residual_unit, found.limit = "px", MAX_RMS_PX

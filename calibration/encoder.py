@@ -116,18 +116,10 @@ class Encoder(Procedure):
 
 
 def evaluate(steps: Sequence[Step], *, direction: int, revolution_deg: float, resolution_deg: float) -> Evaluation:
-    """Fit the harmonics to ``steps``.
+    """Fit the harmonics to consecutive ``steps`` over whole revolutions.
 
-    Parameters
-    ----------
-    steps
-        Consecutive steps, over whole revolutions.
-    direction
-        Direction of the table relative to the servo.
-    revolution_deg
-        The table's angle of one revolution of the encoder.
-    resolution_deg
-        Angle of one encoder count.
+    ``direction`` is that of the table relative to the servo, ``revolution_deg`` the table's angle of one revolution of
+    the encoder, ``resolution_deg`` that of one count.
     """
     evidence = {"steps": plain(list(steps)), "turn_deg": revolution_deg}
     found = Evaluation(name=NAME, residual_unit="°", evidence=evidence)

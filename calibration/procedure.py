@@ -106,33 +106,22 @@ Measured = Generator[Event | Ask | Progress | Evaluation, None, None]
 
 
 class Procedure(ABC):
-    """A calibration procedure; subclasses are dataclasses of their options.
-
-    Attributes
-    ----------
-    names
-        The results that the procedure yields, in order.
-    title
-        The quantity that it calibrates, in words.
-    reference
-        What the quantity is compared with, in words: a template of the procedure's options.
-    devices
-        The devices that its results are bound to.
-    valid_days
-        Days for which its results are valid.
-    requires
-        Names of the results that must be in force; `measure` gets them in this order.
-    plots
-        Functions that draw a result, the main plot first; they return None if there is nothing to draw.
-    """
+    """A calibration procedure; subclasses are dataclasses of their options."""
 
     names: ClassVar[tuple[str, ...]]
+    """The results that the procedure yields, in order."""
     title: ClassVar[str]
+    """The quantity that it calibrates, in words."""
     reference: ClassVar[str]
+    """What the quantity is compared with, in words: a template of the procedure's options."""
     devices: ClassVar[tuple[str, ...]]
+    """The devices that its results are bound to."""
     valid_days: ClassVar[float]
+    """Days for which its results are valid."""
     requires: ClassVar[tuple[str, ...]] = ()
+    """Names of the results that must be in force; `measure` gets them in this order."""
     plots: ClassVar[Sequence[Plot]] = ()
+    """Functions that draw a result, the main plot first; they return None if there is nothing to draw."""
 
     @abstractmethod
     def measure(self, bench: Bench, *required: CalibrationResult) -> Measured:

@@ -135,18 +135,10 @@ def needed_placements(error_rate: float) -> int:
 def evaluate(
     placements: Sequence[Placement], *, error_rate: float, views: int, first_step_deg: float = 90.0, seed: int = 0
 ) -> Evaluation:
-    """Evaluate the similarity of repeated views.
+    """Evaluate the similarity of repeated views of one object at one mark.
 
-    Parameters
-    ----------
-    placements
-        Of the same object at the same mark.
-    error_rate
-        Share of known objects that may fall below ``identify.repeatability``.
-    views, first_step_deg
-        Number of views of the shortest decision, and the rotation between them.
-    seed
-        Of the bootstrap over azimuths.
+    ``error_rate`` is the share of known objects that may fall below ``identify.repeatability``. The shortest decision
+    has ``views``, ``first_step_deg`` apart. ``seed`` is that of the bootstrap over azimuths.
     """
     found = Evaluation(name=NAME, residual_unit="of similarity", limit=1.0 - MIN_SIMILARITY)
     within = np.array([_similar(s.descriptors[0], s.descriptors[1]) for s in placements])

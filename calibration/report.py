@@ -66,18 +66,7 @@ def write_page(
 ) -> None:
     """Write the page: the status of each calibration, and the rejections of newer attempts.
 
-    Parameters
-    ----------
-    path
-        The file.
-    calibrations
-        See `rig.calibrations.CalibrationStore.on_bench`.
-    history
-        All stored results, oldest first.
-    bench, now_utc
-        For the title.
-    notes
-        Further notes for the reader.
+    ``history`` are all stored results, oldest first, and ``notes`` further ones for the reader.
 
     Raises `UsageError`: the file cannot be written.
     """

@@ -65,22 +65,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ObjectSpace:
-    """The cylinder about the axis that holds the objects, and the board's place in it.
-
-    Attributes
-    ----------
-    radius_mm, height_mm
-        Radius and height of the cylinder, which stands on the platter.
-    board_mm
-        Height of the board's middle above the platter in the first position.
-    lens_mm
-        Distance from the lens to the axis at that height, measured by hand; None if it was not measured.
-    """
+    """The cylinder about the axis that holds the objects, and the board's place in it."""
 
     radius_mm: float = 80.0
     height_mm: float = 150.0
+    """Radius and height of the cylinder, which stands on the platter."""
     board_mm: float = 75.0
+    """Height of the board's middle above the platter in the first position."""
     lens_mm: float | None = None
+    """Distance from the lens to the axis at that height, measured by hand; None if it was not measured."""
 
 
 def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: CalibrationResult, space: ObjectSpace) -> Floats:

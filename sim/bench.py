@@ -79,24 +79,10 @@ class ShelfOperator:
     """The simulated operator: puts objects on the table, on the mark to enroll, in any orientation to identify.
 
     Each object stands a little off the table's axis. Calibration boards are available, too.
-
-    Attributes
-    ----------
-    queue
-        Objects to identify, one after the other; the queue repeats.
-    devices, faults
-        The simulated devices and faults of the bench, once it is open.
-    state
-        Store for the state of the table on the benches of this world.
-    optics
-        The camera's optics for the boards, drawn from the world's seed.
-    targets
-        Calibration boards, by name.
-    backdrop
-        See `sim.camera.SimCapture`.
     """
 
     backdrop: Image | None = None
+    """See `sim.camera.SimCapture`."""
 
     def __init__(
         self,
@@ -111,12 +97,17 @@ class ShelfOperator:
         self.next_object = next_object
         self.yaw_deg = yaw_deg
         self.queue: deque[str] = deque()
+        """Objects to identify, one after the other; the queue repeats."""
         self.change: Change | None = None
         self.devices: SimDevices | None = None
         self.faults: Faults | None = None
+        """The simulated devices and faults of the bench, once it is open."""
         self.state: StateStore = MemoryStore()
+        """Store for the state of the table on the benches of this world."""
         self.optics = Optics.of(world)
+        """The camera's optics for the boards, drawn from the world's seed."""
         self.targets: Mapping[str, SimObject] = boards(self.optics)
+        """Calibration boards, by name."""
         self._rng = world.rng("operator")
         self._days = world.rng("days")
 
@@ -234,22 +225,9 @@ def open_sim_bench(
 ) -> Bench:
     """Open a bench whose real drivers are connected to simulated devices, by the code that opens a real bench.
 
-    Parameters
-    ----------
-    config
-        The configuration. Without ``devices``, the simulated servo has factory settings and is configured over its bus.
-    operator
-        The simulated operator, in whose world the devices are.
-    faults
-        Simulated faults with their times.
-    on_fault
-        Called when a simulated fault begins or ends.
-    devices
-        Devices of an earlier bench in this world; the caller closes them.
-    open_now
-        Devices to open now, see `rig.bench.open_bench`.
-    name
-        Name of the bench.
+    The devices are in the world of ``operator``, and the ``faults`` happen at their times; ``on_fault`` is called when
+    one begins or ends. ``devices`` are those of an earlier bench in this world, which the caller closes. Without them,
+    the simulated servo has factory settings and is configured over its bus. ``open_now`` as for `rig.bench.open_bench`.
 
     Raises `ConfigError`: the simulator has no servo of that model, or the model does not support the baud rate.
     `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: a simulated fault affects a device from the start.

@@ -22,31 +22,21 @@ TEXTURE_PX_MM = 10  # five texels for a pixel of the frame; fewer: corners are r
 
 @dataclass(frozen=True)
 class BoardOnPlatter:
-    """The printed board on its stand.
-
-    Attributes
-    ----------
-    board
-        The printed layout.
-    optics
-        The camera that sees it.
-    tilt_deg
-        Lean of its top away from the camera when the table is at home.
-    swing_deg, roll_deg
-        Rotation about the vertical and in its own plane.
-    centre_mm
-        Its centre in the platter's frame: x to the right, y away from the camera, z up.
-    loose_deg
-        Largest rotation about the vertical after the table has moved, for a loose stand.
-    """
+    """The printed board on its stand."""
 
     board: CharucoBoard = field(default_factory=CharucoBoard)
+    """The printed layout."""
     optics: Optics = field(default_factory=Optics)
+    """The camera that sees it."""
     tilt_deg: float = 15.0
+    """Lean of its top away from the camera when the table is at home."""
     swing_deg: float = 0.0
     roll_deg: float = 0.0
+    """Rotation about the vertical and in its own plane."""
     centre_mm: tuple[float, float, float] = (0.0, 0.0, 75.0)
+    """Its centre in the platter's frame: x to the right, y away from the camera, z up."""
     loose_deg: float = 0.0
+    """Largest rotation about the vertical after the table has moved, for a loose stand."""
     name: str = "calibration-board"
 
     def put(self, *, tilt_deg: float, swing_deg: float = 0.0, roll_deg: float = 0.0) -> "BoardOnPlatter":

@@ -61,65 +61,48 @@ class SimCapture:
     for an unknown property `set` returns False and `get` -1. As on V4L2, `isOpened` stays True after an unplug, while
     `grab` fails. The camera begins with the focus that an earlier program left; plugged in again, it wakes out of focus
     with its autofocus on.
-
-    Attributes
-    ----------
-    remembers
-        Whether the driver remembers controls that it has set or asked for once, as ``uvcvideo`` does. A gain that the
-        camera changes by itself is not read back then.
-    every
-        The camera exposes one of this many frames: more than 1 for a slow camera.
-    latency_ns
-        Additional delay of each frame.
-    grab_failures
-        Called at each `grab`; True makes it fail.
-    hangs
-        Whether no frame arrives; `grab` fails after `SELECT_S`.
-    orbits
-        Whether the table moves the camera around the object instead of rotating the object. The camera then sees the
-        room around the object (`sim.room`), and the light stays in the room.
-    blur_px
-        Sigma of an additional blur.
-    noise
-        The paper's motion blur and Gaussian noise of each frame, in addition to the sensor's own noise.
-    times
-        The errors of its time.
-    stamp_shift_ns
-        Jump of the time stamps by a fault.
-    lamp
-        Frequency in Hz and depth of the light's flicker, which leaves bands because rows are read out one after the
-        other; None for a steady light.
-    backdrop
-        What is behind the objects: wall, table and platter, uint8 (480, 640, 3), or another ground of any size for
-        objects that fill the frame. Such frames do not depend on the camera's mounting and on its orbit.
-    visit
-        A hard change of the bench, through which everything is seen (`sim.change`).
-    filters
-        Called in order with each fetched frame and its number; each returns a frame.
     """
 
     def __init__(self, world: World, backdrop: Image | None = None) -> None:
         self.remembers = True
+        """Whether the driver remembers controls that it has set or asked for once, as ``uvcvideo`` does. A gain that
+        the camera changes by itself is not read back then."""
         self._remembered: dict[int, float] = {}
         self.every = 1
+        """The camera exposes one of this many frames: more than 1 for a slow camera."""
         self.latency_ns = 0
+        """Additional delay of each frame."""
         self.grab_failures: list[Callable[[], bool]] = []
+        """Called at each `grab`; True makes it fail."""
         self.hangs = False
+        """Whether no frame arrives; `grab` fails after `SELECT_S`."""
         self.orbits = False
+        """Whether the table moves the camera around the object instead of rotating the object. The camera then sees the
+        room around the object (`sim.room`), and the light stays in the room."""
         self.blur_px = 0.0
+        """Sigma of an additional blur."""
         self.noise = Noise(world.noise.gaussian_variance, world.noise.motion_px)
+        """The paper's motion blur and Gaussian noise of each frame, in addition to the sensor's own noise."""
         self.lamp: tuple[float, float] | None = None
+        """Frequency in Hz and depth of the light's flicker, which leaves bands because rows are read out one after the
+        other; None for a steady light."""
         self.visit: Visit | None = None
+        """A hard change of the bench, through which everything is seen (`sim.change`)."""
         self.filters: list[Callable[[Image, int], Image]] = []
+        """Called in order with each fetched frame and its number; each returns a frame."""
         self._world = world
         self._clock = world.clock
         self._binning = 1
         self._fourcc = _FOURCCS[0]
         self._noise = world.noise
         self.times = FrameTimes(world)
+        """The errors of its time."""
         self.stamp_shift_ns = 0
+        """Jump of the time stamps by a fault."""
         self._draws_bench = backdrop is None
         self.backdrop = empty_platter() if backdrop is None else backdrop
+        """What is behind the objects: wall, table and platter, uint8 (480, 640, 3), or another ground of any size for
+        objects that fill the frame. Such frames do not depend on the camera's mounting and on its orbit."""
         self._height, self._width = self.backdrop.shape[:2]
         # A well-mounted camera sees the objects as they are drawn; calibration boards are drawn through its lens.
         self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount and self._draws_bench else None

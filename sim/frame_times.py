@@ -18,19 +18,7 @@ FPS = 30  # what UVC cameras offer at 640 x 480
 
 
 class FrameTimes:
-    """The errors of a camera's time: offset and jitter of its stamps, its read-out, late and lost frames.
-
-    Attributes
-    ----------
-    offset_ns
-        Mean time from the beginning of the exposure of the first row to the frame's time stamp.
-    readout_ns
-        Time from the exposure of the first row to that of the last one.
-    stamped_late_ns
-        Standard deviation of the delay with which the computer stamps frames during a fault.
-    lost_share
-        Share of the frames that do not arrive; a fault raises it.
-    """
+    """The errors of a camera's time: offset and jitter of its stamps, its read-out, late and lost frames."""
 
     def __init__(self, world: World) -> None:
         noise = world.noise
@@ -38,9 +26,13 @@ class FrameTimes:
         self._jitter_ns = noise.stamp_jitter_ms * 1e6
         self._latency_ns = noise.usb_latency_ms * 1e6
         self.offset_ns = round(abs(world.rng("camera stamps").standard_normal()) * noise.stamp_offset_ms * 1e6)
+        """Mean time from the beginning of the exposure of the first row to the frame's time stamp."""
         self.readout_ns = round(noise.camera_readout_ms * 1e6)
+        """Time from the exposure of the first row to that of the last one."""
         self.stamped_late_ns = 0.0
+        """Standard deviation of the delay with which the computer stamps frames during a fault."""
         self.lost_share = noise.lost_frames
+        """Share of the frames that do not arrive; a fault raises it."""
 
     def exposed_ns(self, stamp_ns: int, frame: int) -> int:
         """Return the true beginning of the exposure of a frame's first row."""

@@ -15,20 +15,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PiecewiseMotion:
-    """Motion with piecewise constant acceleration.
-
-    Attributes
-    ----------
-    start_s : float64 (k,)
-        Times at which the pieces begin, rising; the last piece has no end.
-    position_deg, velocity_dps, acceleration_dps2 : float64 (k,)
-        State at the beginning of each piece, and its acceleration.
-    """
+    """Motion with piecewise constant acceleration."""
 
     start_s: Floats
+    """float64 (k,): times at which the pieces begin, rising; the last piece has no end."""
     position_deg: Floats
     velocity_dps: Floats
     acceleration_dps2: Floats
+    """float64 (k,): state at the beginning of each piece, and its acceleration."""
 
     @property
     def end_s(self) -> float:

@@ -21,33 +21,25 @@ SUPERSAMPLING = 2  # more: less aliasing of fine strokes; each frame takes four 
 
 @dataclass(frozen=True)
 class Optics:
-    """True values for the calibrations of the camera and of the table's axis.
-
-    Attributes
-    ----------
-    focal_px, centre_px : tuple of 2
-        Focal lengths and principal point.
-    distortion : tuple of 5
-        k1, k2, p1, p2, k3 of OpenCV's model.
-    rotation : tuple of 9
-        Rows of the rotation from the room's frame (x right, y away, z up along the table's axis) into the camera's.
-    translation_mm : tuple of 3
-        Centre of the platter's top in the camera's frame.
-    wobble_deg
-        Lean of the axis in a direction that rotates twice as fast as the table, as with a bent bearing. (A lean that
-        rotates with the table cannot be separated from the board's own position.)
-    """
+    """True values for the calibrations of the camera and of the table's axis."""
 
     focal_px: tuple[float, float] = (FOCAL_PX, FOCAL_PX)
     centre_px: tuple[float, float] = (WIDTH / 2, HEIGHT / 2)
+    """tuple of 2: focal lengths and principal point."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """tuple of 5: k1, k2, p1, p2, k3 of OpenCV's model."""
     rotation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, -SIN, -COS, 0.0, COS, -SIN)
+    """tuple of 9: rows of the rotation from the room's frame (x right, y away, z up along the table's axis) into the
+    camera's."""
     translation_mm: tuple[float, float, float] = (
         (CENTRE_PX[0] - WIDTH / 2) * DISTANCE_MM / FOCAL_PX,
         (CENTRE_PX[1] - HEIGHT / 2) * DISTANCE_MM / FOCAL_PX,
         DISTANCE_MM,
     )
+    """tuple of 3: centre of the platter's top in the camera's frame."""
     wobble_deg: float = 0.0
+    """Lean of the axis in a direction that rotates twice as fast as the table, as with a bent bearing. (A lean that
+    rotates with the table cannot be separated from the board's own position.)"""
 
     @classmethod
     def of(cls, world: World) -> Self:

@@ -59,31 +59,21 @@ class PhotographOptions(SimOptions):
 
 @dataclass(frozen=True)
 class PhotographedObjects:
-    """What the camera of the bench can show.
-
-    Attributes
-    ----------
-    enrolled, identified
-        The objects by name, with the photographs that are shown to enroll and to identify them.
-    empty_table
-        The empty table; None if there is no image of it.
-    first
-        A photograph, whose size and colours the others must have.
-    header
-        Of this photograph.
-    region
-        The part of the frames that is described, if a table gives one for all its photographs; None: the whole frame.
-    findings
-        Notes about files that cannot be used.
-    """
+    """What the camera of the bench can show."""
 
     enrolled: Mapping[str, PhotographsOnTable]
     identified: Mapping[str, PhotographsOnTable]
+    """The objects by name, with the photographs that are shown to enroll and to identify them."""
     empty_table: PhotographsOnTable | None
+    """The empty table; None if there is no image of it."""
     first: Path
+    """A photograph, whose size and colours the others must have."""
     header: Header
+    """Of this photograph."""
     region: tuple[int, int, int, int] | None
+    """The part of the frames that is described, if a table gives one for all its photographs; None: the whole frame."""
     findings: tuple[str, ...]
+    """Notes about files that cannot be used."""
 
     @classmethod
     def read(cls, options: PhotographOptions) -> "PhotographedObjects":

@@ -28,16 +28,8 @@ STRIP = 32  # rows that are computed together: they stay in the processor's cach
 class Sensor:
     """A colour sensor with its lens' vignetting and its noise.
 
-    Parameters
-    ----------
-    noise
-        Its noise.
-    rng
-        Generator of the noise tile; each frame uses a part of it.
-    binning
-        Number of pixels along each side that are combined into one.
-    size
-        Width and height of the scene in pixels.
+    ``rng`` draws the noise tile, of which each frame uses a part. ``binning`` pixels along each side are combined into
+    one. ``size`` is width and height of the scene in pixels.
     """
 
     def __init__(
@@ -68,18 +60,9 @@ class Sensor:
     ) -> Image:
         """Return one frame, uint8, of the size of the scene, or smaller by the binning.
 
-        Parameters
-        ----------
-        scene
-            The scene under nominal light, 0..255, (height, width, 3).
-        light
-            The light relative to the nominal one.
-        exposure
-            Exposure time relative to the nominal one.
-        gains
-            Amplification, white balance included.
-        rng
-            Generator of this frame for the flicker of the light and for the part of the noise tile.
+        ``scene``, (height, width, 3), has the levels 0..255 under nominal light; ``light`` and ``exposure`` are
+        relative to the nominal ones, and ``gains`` include the white balance. ``rng`` is that of this frame, for the
+        flicker of the light and the part of the noise tile.
         """
         flicker = 1 + self._noise.light_flicker * rng.standard_normal()
         if light != self._light_key:

@@ -29,25 +29,17 @@ MAX_FILE_BYTES = 10_000_000
 
 @dataclass(frozen=True, slots=True)
 class Contribution:
-    """One source in the uncertainty budget of a quantity (JCGM 100:2008, 5.1).
-
-    Attributes
-    ----------
-    source
-        The source in words.
-    kind
-        "A": evaluated from the scatter of the measurements; "B": from other knowledge, such as a data sheet.
-    uncertainty, unit
-        The source's standard uncertainty.
-    sensitivity
-        Change of the quantity for a change of the source by 1.
-    """
+    """One source in the uncertainty budget of a quantity (JCGM 100:2008, 5.1)."""
 
     source: str
+    """The source in words."""
     kind: Literal["A", "B"]
+    """A: evaluated from the scatter of the measurements; B: from other knowledge, such as a data sheet."""
     uncertainty: Annotated[FiniteFloat, Field(ge=0)]
     unit: str
+    """The source's standard uncertainty."""
     sensitivity: FiniteFloat = 1.0
+    """Change of the quantity for a change of the source by 1."""
 
     @property
     def part(self) -> float:
@@ -90,31 +82,6 @@ class Estimate:
 class CalibrationResult:
     """The result of one calibration.
 
-    Attributes
-    ----------
-    name
-        Name of the calibration: ``imu.scale``, ``camera.intrinsics``.
-    estimates
-        The quantities by name; empty if nothing could be estimated.
-    residual, limit
-        The worst residual of the fit and its limit, in ``residual_unit``.
-    rejections
-        Reasons why the estimates must not be used; empty if the calibration passed.
-    settings
-        The settings that the result applies, by key of the configuration.
-    valid_days
-        Days for which the result is valid; None: until the device changes.
-    when_utc
-        Time of the calibration, by the bench's clock.
-    reference
-        What the quantities were compared with, in words.
-    operator
-        Who calibrated: the account, or the person at a page of a server.
-    device
-        The calibrated devices and their bench (`rig.calibrations.apparatus`). The result is valid only for them.
-    evidence
-        The measurements, enough to fit them again.
-
     Raises `ValueError`: a result without rejections has no estimate, one with rejections has settings, or ``when_utc``
     has no time zone.
     """
@@ -122,18 +89,29 @@ class CalibrationResult:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     name: str
+    """Name of the calibration: ``imu.scale``, ``camera.intrinsics``."""
     estimates: Mapping[str, Estimate]
+    """The quantities by name; empty if nothing could be estimated."""
     residual: FiniteFloat | None
     limit: FiniteFloat | None
+    """The worst residual of the fit and its limit, in ``residual_unit``."""
     residual_unit: str
     rejections: tuple[CalibrationRejection, ...]
+    """Reasons why the estimates must not be used; empty if the calibration passed."""
     when_utc: AwareDatetime
+    """Time of the calibration, by the bench's clock."""
     reference: str
+    """What the quantities were compared with, in words."""
     operator: str
+    """Who calibrated: the account, or the person at a page of a server."""
     device: Mapping[str, Any]
+    """The calibrated devices and their bench (`rig.calibrations.apparatus`). The result is valid only for them."""
     evidence: Mapping[str, Any]
+    """The measurements, enough to fit them again."""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    """The settings that the result applies, by key of the configuration."""
     valid_days: PositiveFloat | None = None
+    """Days for which the result is valid; None: until the device changes."""
     software: str = field(default_factory=lambda: f"hbr-rig {version('hbr-rig')}")
 
     def __post_init__(self) -> None:

@@ -49,22 +49,10 @@ def candidates_chart(
 ) -> Chart:
     """Return the chart of the best five candidates: their probabilities, or their scores without them, after each view.
 
-    In the dense search, "not enrolled" is one more.
-
-    Parameters
-    ----------
-    ranked
-        The candidates after each view; at least one view.
-    styles
-        The styles of the page.
-    answer
-        The object that was found; its line is thick.
-    min_score
-        An object with a lower score is unknown: a dashed line, without it if it is far from the scores.
-    rotated_deg
-        For each view of a search in motion, the rotation since the first view.
-    enough_deg
-        The rotation after which the evidence was enough for an answer; None if it was not.
+    In the dense search, "not enrolled" is one more. There is at least one view. The line of the ``answer`` is thick. An
+    object with a score below ``min_score`` is unknown: a dashed line, left out if it is far from the scores. In motion,
+    ``rotated_deg`` is the rotation since the first view, by view, and ``enough_deg`` that after which the evidence was
+    enough for an answer.
     """
     values = [{one.name: _value(one) for one in _all(event)} for event in ranked]
     x = [event.index + 1.0 if rotated_deg is None else rotated_deg[event.index] for event in ranked]

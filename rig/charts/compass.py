@@ -68,20 +68,9 @@ class PathStep(NamedTuple):
 def polar_path(start_deg: float, steps: Sequence[PathStep], *, named: Collection[int]) -> str:
     """Draw the camera's positions, seen from above, and the rotations between them.
 
-    The path is a spiral: its radius grows with every view, so that it never covers itself.
-
-    Parameters
-    ----------
-    start_deg
-        Azimuth of the first view.
-    steps
-        The measured rotations between the views.
-    named
-        Numbers of the views that the report shows. They have their number, the others a dot.
-
-    Returns
-    -------
-    SVG markup. View k is at the sum of ``start_deg`` and the first k rotations.
+    The path is a spiral: its radius grows with every view, so that it never covers itself. View k is at the sum of
+    ``start_deg``, the azimuth of the first one, and the first k of the measured rotations. The views ``named``, which
+    the report shows, have their number, the others a dot.
     """
     azimuth_deg = list(accumulate((step.rotation_deg for step in steps), initial=start_deg))
     numbers = [1, *(step.number for step in steps)]

@@ -51,31 +51,21 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """Label and scale of an axis.
-
-    Attributes
-    ----------
-    label
-        The quantity and its unit.
-    log
-        Logarithmic scale.
-    falling
-        Values grow downwards, as rows of an image do.
-    whole
-        Ticks at whole numbers only.
-    span
-        Values that the axis includes in any case.
-    ticks, names
-        Positions of the ticks, and their labels; chosen automatically if empty.
-    """
+    """Label and scale of an axis."""
 
     label: str
+    """The quantity and its unit."""
     log: bool = False
+    """Logarithmic scale."""
     falling: bool = False
+    """Values grow downwards, as rows of an image do."""
     whole: bool = False
+    """Ticks at whole numbers only."""
     span: tuple[float, ...] = ()
+    """Values that the axis includes in any case."""
     ticks: tuple[float, ...] = ()
     names: tuple[str, ...] = ()
+    """Positions of the ticks, and their labels; chosen automatically if empty."""
 
 
 @dataclass(frozen=True)

@@ -12,21 +12,14 @@ DATABASE_NAME: Final = "catalog.sqlite"
 
 @dataclass(frozen=True, slots=True)
 class CatalogPlace:
-    """Place of a catalog.
-
-    Attributes
-    ----------
-    path
-        Folder on this computer. Without ``url`` it holds the whole catalog, else the journal and the local copy.
-    url
-        URL of a PostgreSQL database, ``postgresql+psycopg://HOST/DATABASE``; None for an SQLite file in ``path``.
-    images
-        Folder or URL (``s3://BUCKET/FOLDER``) of the images; None for ``path``.
-    """
+    """Place of a catalog."""
 
     path: Path
+    """Folder on this computer. Without ``url`` it holds the whole catalog, else the journal and the local copy."""
     url: str | None = None
+    """URL of a PostgreSQL database, ``postgresql+psycopg://HOST/DATABASE``; None for an SQLite file in ``path``."""
     images: str | None = None
+    """Folder or URL (``s3://BUCKET/FOLDER``) of the images; None for ``path``."""
 
     @classmethod
     def of(cls, place: "str | os.PathLike[str] | CatalogPlace") -> "CatalogPlace":

@@ -16,37 +16,25 @@ GROUP = "rig.imus"
 
 @dataclass(frozen=True, slots=True)
 class ImuKind:
-    """A row of the table.
-
-    Attributes
-    ----------
-    key : str
-        Value of ``imu.model``.
-    name : str
-        Name in messages.
-    addresses : tuple of int
-        Possible I2C addresses, the default first.
-    register, identities : int, tuple of int
-        The register that identifies the sensor, and its values.
-    driver : str
-        ``module:callable`` that opens the sensor and returns an `rig.devices.imu.Imu`; empty if there is no driver.
-    simulator : str
-        ``module:callable``, which takes the world and ``address``, and returns a `sim.imu.inertial.SimulatedImu`.
-    settings : tuple of str
-        Keys of ``[imu]`` that the driver takes, apart from the address.
-    note : str
-        Note on the sensor for the operator; reported when the bench is opened, and by ``rig doctor``.
-    """
+    """A row of the table."""
 
     key: str
+    """Value of ``imu.model``."""
     name: str
+    """Name in messages."""
     addresses: tuple[int, ...]
+    """Possible I2C addresses, the default first."""
     register: int
     identities: tuple[int, ...]
+    """The register that identifies the sensor, and its values."""
     driver: str = ""
+    """``module:callable`` that opens the sensor and returns an `rig.devices.imu.Imu`; empty if there is no driver."""
     simulator: str = ""
+    """``module:callable``, which takes the world and ``address``, and returns a `sim.imu.inertial.SimulatedImu`."""
     settings: tuple[str, ...] = ()
+    """Keys of ``[imu]`` that the driver takes, apart from the address."""
     note: str = ""
+    """Note on the sensor for the operator; reported when the bench is opened, and by ``rig doctor``."""
 
 
 _AT: Final = (0x68, 0x69)  # AD0 low or high

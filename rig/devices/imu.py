@@ -28,21 +28,14 @@ class ImuIdentity:
 
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
-    """Consecutive samples, oldest first.
-
-    Attributes
-    ----------
-    time_ns : int64 (n,)
-        Sample times on the bench's clock, evenly spaced.
-    gyro_dps : float64 (n, 3)
-        Angular rate about the sensor's x, y, z.
-    lost : int
-        Samples that were lost before these (FIFO overflow); an integral across them is not valid.
-    """
+    """Consecutive samples, oldest first."""
 
     time_ns: NDArray[np.int64]
+    """int64 (n,): sample times on the bench's clock, evenly spaced."""
     gyro_dps: NDArray[np.float64]
+    """float64 (n, 3): angular rate about the sensor's x, y, z."""
     lost: int = 0
+    """Samples that were lost before these (FIFO overflow); an integral across them is not valid."""
 
 
 class Imu(Protocol):

@@ -47,14 +47,8 @@ class Mpu6050:
 
     Opening it resets the sensor, wakes it up, writes the settings and reads them back.
 
-    Parameters
-    ----------
-    range_dps
-        Full scale of the gyro: 250, 500, 1000 or 2000 °/s.
-    rate_hz
-        Samples per second: 1000 divided by a whole number up to 256.
-    bandwidth_hz
-        Bandwidth of the gyro's low-pass: 188, 98, 42, 20, 10 or 5 Hz; below half of ``rate_hz`` to avoid aliasing.
+    ``range_dps`` is a key of `LSB_PER_DPS`, ``rate_hz`` 1000 divided by a whole number up to 256, and ``bandwidth_hz``
+    that of the gyro's low-pass, a key of `_FILTERS`, below half of the rate to avoid aliasing.
 
     Raises `ConfigError`: the sensor does not have a setting. `DeviceNotFound`: the bus cannot be opened, or no device
     acknowledges the address. `DeviceMismatch`: another device answers there. `DeviceFault`: the sensor does not keep

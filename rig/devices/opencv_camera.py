@@ -92,21 +92,13 @@ def _value_text(setting: str, value: float) -> str:
 class OpenCvCamera:
     """`rig.devices.camera.Camera` on anything that behaves like `cv2.VideoCapture`.
 
-    Parameters
-    ----------
-    capture
-        An open source, for example from `open_capture`. The camera closes it.
-    settings
-        Requested settings; None leaves one to the camera, except the focus, which is locked after the autofocus.
-        `rejected_settings` lists those that the camera did not accept.
-    name, device
-        See `CameraIdentity`.
-    reopen
-        Opens the source again (raises DeviceNotFound while it is missing). A camera that was unplugged for less than
-        `TIMEOUT_S` gets its settings again and continues.
-    node
-        Returns what identifies the device file now, None if it is missing. Another value than at the opening means that
-        the camera was unplugged: `cv2.VideoCapture.isOpened` stays True on V4L2.
+    The camera closes ``capture``, an open source. None in ``settings`` leaves one to the camera, except the focus,
+    which is locked after the autofocus. ``name`` and ``device`` are those of its `CameraIdentity`.
+
+    ``reopen`` opens the source again (raises DeviceNotFound while it is missing): a camera that was unplugged for less
+    than `TIMEOUT_S` gets its settings again and continues. ``node`` returns what identifies the device file now, None
+    if it is missing. Another value than at the opening means that the camera was unplugged, because
+    `cv2.VideoCapture.isOpened` stays True on V4L2.
 
     Raises `DeviceSilent`: the camera delivers no frames.
     """
@@ -135,6 +127,7 @@ class OpenCvCamera:
         # Lock the settings, then read back what the camera made of them.
         self._supported: set[int] = set()
         self.rejected_settings: tuple[RejectedSetting, ...] = self._configure(self._settings)
+        """The settings that the camera did not accept."""
         self.identity = CameraIdentity(
             name,
             round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),

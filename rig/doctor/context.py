@@ -16,27 +16,19 @@ from rig.safety.saved_state import Holder, busy, holder
 
 @dataclass
 class DoctorContext:
-    """A bench that is not open, and the computer to which its devices are connected.
-
-    Attributes
-    ----------
-    options
-        Options of `rig` that select this bench: ``--bench sim``.
-    file_options
-        Options of `rig config set` that select this configuration file.
-    holder
-        The program that uses the bench now.
-    identities
-        The devices that the checks found, for later checks.
-    """
+    """A bench that is not open, and the computer to which its devices are connected."""
 
     computer: Computer
     config: RigConfig
     bench: str
     options: tuple[str, ...] = ()
+    """Options of `rig` that select this bench: ``--bench sim``."""
     file_options: tuple[str, ...] = ()
+    """Options of `rig config set` that select this configuration file."""
     holder: Holder | None = None
+    """The program that uses the bench now."""
     identities: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """The devices that the checks found, for later checks."""
 
     def step(self, step: NextStep) -> NextStep:
         """Return a step whose command is for this bench."""

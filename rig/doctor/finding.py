@@ -279,30 +279,20 @@ class FindingCode(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding about the bench.
-
-    Attributes
-    ----------
-    level
-        Its severity.
-    code
-        What was found.
-    parameters
-        The values in its text and other evidence, units in the keys.
-    steps
-        What fixes the problem, as the next step of an error; empty if nothing does.
-    topic
-        The checked part, for example ``servo``.
-    exit_code
-        The exit code of `rig doctor` for this finding; 0 unless it is bad. Topic and exit code come from the check.
-    """
+    """One finding about the bench."""
 
     level: Severity
+    """Its severity."""
     code: FindingCode
+    """What was found."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    """The values in its text and other evidence, units in the keys."""
     steps: NextSteps = ()
+    """What fixes the problem, as the next step of an error; empty if nothing does."""
     topic: str = ""
+    """The checked part, for example ``servo``."""
     exit_code: int = 0
+    """The exit code of `rig doctor` for this finding; 0 unless it is bad. Topic and exit code come from the check."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", masked(self.parameters))

@@ -26,20 +26,8 @@ def thumbnail(
 ) -> Image:
     """Fit an image into ``size`` (width, height) without distortion, centred on dark grey.
 
-    Parameters
-    ----------
-    image_bgr
-        uint8 (H, W, 3).
-    size
-        Width and height in pixels.
-    region
-        The part to show: x, y, width, height in pixels; None shows all.
-    box
-        Box to outline in it: x, y, width, height in pixels of the part.
-
-    Returns
-    -------
-    uint8 (height, width, 3) BGR, a new array.
+    ``image_bgr`` is uint8 (H, W, 3), and so is the new array. ``region`` is the part to show, and ``box`` is outlined
+    in it: x, y, width, height in pixels, those of the box in the part.
 
     Raises `ValueError`: the region contains no part of the image.
     """
@@ -69,20 +57,9 @@ def data_uri(image_bgr: Image) -> str:
 
 
 def contact_sheet(tiles_bgr: Sequence[Image], azimuth_deg: Sequence[float], label: str) -> str:
-    """Lay out views row by row, each with its azimuth below.
+    """Lay out views row by row, each with its azimuth below, as SVG with one JPEG: it is smaller than n of them.
 
-    Parameters
-    ----------
-    tiles_bgr
-        n images, uint8 (H, W, 3), all of one size; at least one.
-    azimuth_deg
-        Their n azimuths in degrees.
-    label
-        Alternative text.
-
-    Returns
-    -------
-    SVG markup that contains a single JPEG: it is smaller than n of them.
+    ``tiles_bgr`` are at least one image, uint8 (H, W, 3), all of one size; ``label`` is the alternative text.
     """
     height, width = tiles_bgr[0].shape[:2]
     columns = min(_COLUMNS, len(tiles_bgr))

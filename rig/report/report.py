@@ -83,17 +83,7 @@ def render_report(
     *,
     meta: Meta,
 ) -> str:
-    """Return the page; sections without content are left out.
-
-    Parameters
-    ----------
-    title, summary
-        The headline and a sentence below it, plain text.
-    enrollments, identifications
-        In the order of the page.
-    meta
-        Conditions and wall-clock times.
-    """
+    """Return the page, with ``summary`` as a sentence below the title; sections without content are left out."""
     styles = Styles()
     with_truth = any(record.truth is not None for record in identifications)
     return _template().render(

@@ -136,16 +136,9 @@ class GyroRotationMeter:
     call `end` when `peak_dps` shows that the table stands still again. A rotation counts from the previous `end`: if
     the platter slips on its shaft between two moves, the next rotation includes the slip, unless samples were lost.
 
-    Parameters
-    ----------
-    imu
-        The sensor on the platter.
-    axis, sign
-        The sensor's vertical axis, and +1 if it points up, so that counter-clockwise is positive.
-    scale
-        True rate divided by measured rate, from a calibration.
-    scale_sigma
-        Standard uncertainty of ``scale``; without calibration the spread of new parts.
+    ``axis`` and ``sign`` are the sensor's vertical axis, and +1 if it points up, so that counter-clockwise is positive.
+    ``scale`` is the true rate divided by the measured one; without calibration its uncertainty ``scale_sigma`` is the
+    spread of new parts.
     """
 
     def __init__(

@@ -57,26 +57,18 @@ class FaultTrigger(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A simulated fault with its time.
-
-    Attributes
-    ----------
-    kind
-        Its kind.
-    values
-        The values of all its parameters.
-    trigger, mark
-        It begins at ``mark`` seconds of the bench's clock, or during the move or after the view with that number.
-        `sim.faults.injector.Faults` counts moves and views from 0.
-    for_s
-        Its duration; None: it lasts until it is ended.
-    """
+    """A simulated fault with its time."""
 
     kind: FaultKind
+    """Its kind."""
     values: Mapping[str, float] = field(default_factory=dict)
+    """The values of all its parameters."""
     trigger: FaultTrigger = FaultTrigger.AT
     mark: float = 0.0
+    """It begins at ``mark`` seconds of the bench's clock, or during the move or after the view with that number.
+    `sim.faults.injector.Faults` counts moves and views from 0."""
     for_s: float | None = None
+    """Its duration; None: it lasts until it is ended."""
 
     def __str__(self) -> str:
         given = "".join(

@@ -82,18 +82,9 @@ class SimHead:
     `detach` and `held` (as of `sim.i2c.SimI2cBus`; here it is for bytes to the host), `reset`, `hang`, `unplugged` (the
     board runs without its cable), the outputs and their history, and the filters.
 
-    Parameters
-    ----------
-    world
-        The simulated world.
-    clock_error
-        Relative error of its clock; positive is too fast.
-    serial
-        The serial number in its flash.
-    library
-        Another board with the interface of ``firmware/boards/host/board.h``; default: the core on this computer.
-    flash
-        Program for a library that emulates a microcontroller.
+    ``clock_error`` is the relative error of its clock, positive if it is fast, and ``serial`` the serial number in its
+    flash. ``library`` is another board with the interface of ``firmware/boards/host/board.h``, by default the core on
+    this computer, and ``flash`` the program for a library that emulates a microcontroller.
 
     ``world_at_board_time`` is the world at the board's own time, for its sensors. ``filters`` are called with
     (``to_head``, byte) for each byte, and return the byte that arrives, or None if it is lost. ``listeners`` are called

@@ -30,23 +30,8 @@ class InertialModel:
     one-sided density. The force is gravity with a bias and white noise. Both pass a second-order Butterworth low-pass.
     The centripetal and tangential acceleration of a sensor off the axis is left out (1 cm at 90 °/s: 2.5 mg).
 
-    Parameters
-    ----------
-    world
-        Provides the motion, the noise model, and the streams ``name-part`` (drawn once), ``name-noise`` and
-        ``name-flicker``.
-    name
-        Name of the sensor.
-    gyro_noisier
-        Ratio of its gyro's noise density to that of the noise model.
-
-    Attributes
-    ----------
-    up : float64 (3,)
-        The vertical in the sensor's axes.
-    gyro_gain, gyro_bias_dps, gyro_slope_dps_c, accel_bias_g : float64 (3,)
-        The true values, for tests. The random walk of the gyro's bias continues from its value; the bias also grows by
-        the slope for each degree of warming.
+    ``world`` provides the motion, the noise model, and the streams ``name-part`` (drawn once), ``name-noise`` and
+    ``name-flicker``. ``gyro_noisier`` is the ratio of its gyro's noise density to that of the noise model.
     """
 
     def __init__(self, world: World, name: str, gyro_noisier: float = 1.0) -> None:
@@ -58,7 +43,10 @@ class InertialModel:
         self.accel_bias_g: Floats = noise.accel_bias_g * part.standard_normal(3)
         roll, pitch = (radians(noise.imu_tilt_deg * z) for z in part.standard_normal(2))
         self.up: Floats = np.array([-sin(pitch), sin(roll) * cos(pitch), cos(roll) * cos(pitch)])
+        """float64 (3,): the vertical in the sensor's axes."""
         self.gyro_slope_dps_c: Floats = noise.gyro_bias_slope_dps_c * part.standard_normal(3)
+        """float64 (3,): the true values, for tests. The random walk of the gyro's bias continues from its value; the
+        bias also grows by the slope for each degree of warming."""
         self._powered_ns = world.clock.now_ns()
         self._flicker_rng = world.rng(f"{name}-flicker")
         self._flicker_dps: Floats = gyro_noisier * np.broadcast_to(noise.gyro_flicker_dps, 3)
@@ -169,18 +157,6 @@ class SimulatedImu:
     """A sensor on the platter with numbered registers; an `sim.i2c.I2cDevice`.
 
     Interface to the bench and its faults, besides that to the bus:
-
-    Attributes
-    ----------
-    inertial
-        Bias, gain, vertical and warming of this part.
-    temperature_c
-        Temperature of its surroundings.
-    clock_error
-        Relative error of its clock, positive if it is fast; set it before the sensor wakes, or by `run_clock`.
-    distortions
-        Each receives the words of samples, int16 (n, 7): accelerometer x, y, z, temperature, gyro x, y, z. It returns
-        the words that the sensor delivers.
     """
 
     GYRO_NOISIER: ClassVar[float] = 1.0
@@ -191,9 +167,14 @@ class SimulatedImu:
     def __init__(self, world: World, address: int) -> None:
         self.address = address
         self.inertial = InertialModel(world, f"imu-{address:02x}", gyro_noisier=self.GYRO_NOISIER)
+        """Bias, gain, vertical and warming of this part."""
         self.temperature_c = 25.0
+        """Temperature of its surroundings."""
         self.clock_error = 0.0
+        """Relative error of its clock, positive if it is fast; set it before the sensor wakes, or by `run_clock`."""
         self.distortions: list[Callable[[Words], Words]] = []
+        """Each receives the words of samples, int16 (n, 7): accelerometer x, y, z, temperature, gyro x, y, z. It
+        returns the words that the sensor delivers."""
         self._clock = world.clock
         self.power_cycle()
 

@@ -18,12 +18,8 @@ def blend(below: Image, above: Image, cover: Image) -> None:
 def place(image: Image, seen: Image, clear: Image, corner_px: Floats) -> None:
     """Draw ``seen``, already weighted by its cover, on ``image``, at a position that may be between pixels.
 
-    Parameters
-    ----------
-    image, seen, clear
-        uint8 (H, W, 3), (h, w, 3), (h, w, 3); ``clear`` is the weight of the image below, 255 outside ``seen``.
-    corner_px
-        Position (x, y) of the upper left pixel's centre in the image.
+    They are uint8 (H, W, 3) and (h, w, 3); ``clear``, (h, w, 3), is the weight of the image below, 255 outside
+    ``seen``. ``corner_px`` is the position (x, y) of the upper left pixel's centre in the image.
     """
     x, y = (int(c) for c in np.floor(corner_px))
     right, down = float(corner_px[0] - x), float(corner_px[1] - y)

@@ -26,35 +26,24 @@ _LINING_ROWS = 4
 
 @dataclass(frozen=True)
 class Revolution:
-    """A textured surface of revolution.
-
-    Parameters
-    ----------
-    profile
-        (radius, height) in millimetres from the top to the foot; heights do not increase. A vessel's profile begins
-        at the inner edge of its rim.
-    paint
-        Returns the texture of the outside for its (rows, columns): uint8 (rows, columns, 3). Rows run along the
-        profile, columns once around, counter-clockwise, the front (azimuth 0) in the middle.
-    inside
-        (radius, height) from the rim down to the centre of the vessel's floor; empty for a closed body.
-    lining
-        Colour of the inside, B, G, R.
-    at
-        Position of the axis in the object's frame, in millimetres.
-    shine
-        Strength of the highlight, 0..1.
-    layer
-        Parts of higher layers cover those of lower ones.
-    """
+    """A textured surface of revolution."""
 
     profile: Curve
+    """(radius, height) in millimetres from the top to the foot; heights do not increase. A vessel's profile begins at
+    the inner edge of its rim."""
     paint: Paint
+    """Returns the texture of the outside for its (rows, columns): uint8 (rows, columns, 3). Rows run along the profile,
+    columns once around, counter-clockwise, the front (azimuth 0) in the middle."""
     inside: Curve = ()
+    """(radius, height) from the rim down to the centre of the vessel's floor; empty for a closed body."""
     lining: Colour = (235, 238, 238)
+    """Colour of the inside, B, G, R."""
     at: tuple[float, float] = (0.0, 0.0)
+    """Position of the axis in the object's frame, in millimetres."""
     shine: float = 0.0
+    """Strength of the highlight, 0..1."""
     layer: int = 0
+    """Parts of higher layers cover those of lower ones."""
 
     def drawings(self, pose: ObjectPose) -> list[Drawing]:
         foot_px = pose.to_image(np.array([[*self.at, 0.0]]))[0]

@@ -24,21 +24,14 @@ class Part(Protocol):
 
 @dataclass(frozen=True)
 class Solid:
-    """A built-in object.
-
-    Parameters
-    ----------
-    name
-        Its name in catalogs and reports.
-    parts
-        Its parts.
-    symmetry_deg
-        The smallest rotation after which it looks the same: 360 for none, 360 / n for n-fold, 0 for free symmetry.
-    """
+    """A built-in object."""
 
     name: str
+    """Its name in catalogs and reports."""
     parts: tuple[Part, ...] = field(repr=False)
+    """Its parts."""
     symmetry_deg: float = 360.0
+    """The smallest rotation after which it looks the same: 360 for none, 360 / n for n-fold, 0 for free symmetry."""
 
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
         """Draw the object into ``image`` as `sim.objects.projection.Visible` describes."""

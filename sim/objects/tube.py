@@ -27,23 +27,17 @@ class Tube:
     first behind the body, which then covers the parts that are inside or behind it; then the part on the camera's side
     of the axis, in front of the body. There each round end is cut by the part that would be inside the body: nothing if
     the joint faces the camera, all of it if the joint is at the side.
-
-    Parameters
-    ----------
-    path
-        (x, y, z, radius) in millimetres in the object's frame; the curve runs straight between the points.
-    colour
-        B, G, R.
-    joints
-        Number of ends that are joined to the side of a body in the same layer: 2 (handle), 1 (spout: the first), or 0.
-    layer
-        As in `sim.objects.revolution.Revolution`.
     """
 
     path: Curve
+    """(x, y, z, radius) in millimetres in the object's frame; the curve runs straight between the points."""
     colour: Colour
+    """B, G, R."""
     joints: int = 2
+    """Number of ends that are joined to the side of a body in the same layer: 2 (handle), 1 (spout: the first), or
+    0."""
     layer: int = 0
+    """As in `sim.objects.revolution.Revolution`."""
 
     reach_mm = 0.0
 

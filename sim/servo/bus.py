@@ -51,26 +51,19 @@ class ServoBus:
     An instruction reaches the devices when its last byte has arrived. An answer begins after the device's Return Delay
     Time. A device with another baud rate than the host receives nothing. The answers of two devices with one id
     collide. Bytes of the host do not collide with the answer of a device here.
-
-    Attributes
-    ----------
-    taps
-        Called with each frame in both directions, as the host sees it.
-    filters
-        Called in their order with each frame from a device to the host. A filter returns the frame that the host
-        receives instead (other bytes, another time), or None if the frame is lost.
-    echo
-        Whether the adapter receives its own bytes, like a half-duplex one without a switched receiver.
-    deaf
-        Whether all bytes of the host are lost.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
         self.taps: list[Callable[[SentBytes], None]] = []
+        """Called with each frame in both directions, as the host sees it."""
         self.filters: list[Callable[[SentBytes], SentBytes | None]] = []
+        """Called in their order with each frame from a device to the host. A filter returns the frame that the host
+        receives instead (other bytes, another time), or None if the frame is lost."""
         self.echo = False
+        """Whether the adapter receives its own bytes, like a half-duplex one without a switched receiver."""
         self.deaf = False
+        """Whether all bytes of the host are lost."""
         self._devices: list[SimServo] = []
         self._deliver: Callable[[SentBytes], None] | None = None
         self._sent_until_ns = 0

@@ -31,23 +31,9 @@ class SimServo:
     """A servo whose horn is the table's shaft.
 
     If one register of a block rejects its value, nothing of the block is written. The answer to a new id, baud rate or
-    delay still uses the old one.
-
-    Parameters
-    ----------
-    world
-        The world that it rotates, or a gear. A second servo on the same bus has another world on the same clock.
-    model
-        A name for `sim.servo.models.servo_model`.
-    bus_id, baudrate
-        Initial settings.
-    firmware
-        Firmware Version; default: that of the model.
-    center_counts
-        The encoder's reading at the shaft's angle 0; default: the middle of its revolution.
-
-    ``distortions`` are called with the memory after its live registers are updated and before they are read, to falsify
-    the readings.
+    delay still uses the old one. A second servo on the same bus has another world on the same clock. ``firmware`` is
+    by default that of the model, and ``center_counts``, the encoder's reading at the shaft's angle 0, the middle of its
+    revolution.
 
     Raises `ValueError`: there is no such model, id or baud rate.
     """
@@ -68,6 +54,7 @@ class SimServo:
         self.model = row
         self.motor = Motor(world, row)
         self.distortions: list[Callable[[Memory], None]] = []
+        """Called with the memory after its live registers are updated and before they are read, to falsify them."""
         self._clock = world.clock
         self._powered = True
         self._timers: dict[Callable[[], None], Timer] = {}

@@ -26,45 +26,31 @@ GAINS = (
 
 @dataclass(frozen=True)
 class ServoModel:
-    """A servo model.
-
-    Attributes
-    ----------
-    name
-        Name of its row in `rig.config.servos`.
-    firmware
-        Firmware of a new servo.
-    initial
-        Initial values of registers by name; default: 0.
-    ranges
-        Valid values of registers by name; default: all that fit.
-    supply_v
-        Supply voltage, for which the specifications give a speed.
-    no_load_dps
-        Speed without load at that supply, in °/s: the maximum.
-    acceleration_dps2
-        Acceleration at stall torque with a light platter, in °/s²: the maximum. It is an estimate (no-load speed within
-        about 0.1 s): the e-manual gives the torque, but the inertia depends on the platter.
-    stall_error_deg
-        Error at which the position controller pushes with the stall torque; X series: PWM Limit over Position P Gain /
-        128 (e-manual, Position PID Gain), in counts.
-    inertia_s
-        Time constant of the speed. With more than a quarter of the lag, which is the ``stall_error_deg`` over the
-        maximum speed, the shaft overshoots; 0: the D gain damps it.
-    stall_current
-        Present Current at stall, in the register's unit; None for models that report Present Load instead.
-    """
+    """A servo model."""
 
     name: str
+    """Name of its row in `rig.config.servos`."""
     firmware: int
+    """Firmware of a new servo."""
     initial: Mapping[str, int]
+    """Initial values of registers by name; default: 0."""
     ranges: Mapping[str, Container[int]]
+    """Valid values of registers by name; default: all that fit."""
     supply_v: float
+    """Supply voltage, for which the specifications give a speed."""
     no_load_dps: float
+    """Speed without load at that supply, in °/s: the maximum."""
     acceleration_dps2: float = 3000.0
+    """Acceleration at stall torque with a light platter, in °/s²: the maximum. It is an estimate (no-load speed within
+    about 0.1 s): the e-manual gives the torque, but the inertia depends on the platter."""
     stall_error_deg: float = 885 / (640 / 128) * 360 / 4096
+    """Error at which the position controller pushes with the stall torque; X series: PWM Limit over Position P Gain /
+    128 (e-manual, Position PID Gain), in counts."""
     inertia_s: float = 0.0
+    """Time constant of the speed. With more than a quarter of the lag, which is the ``stall_error_deg`` over the
+    maximum speed, the shaft overshoots; 0: the D gain damps it."""
     stall_current: int | None = None
+    """Present Current at stall, in the register's unit; None for models that report Present Load instead."""
 
 
 def _read() -> dict[str, ServoModel]:

@@ -62,15 +62,9 @@ class DynamixelServo:
 
     Opening only reads, to compare the model with the configured one. Nothing moves, and the torque stays as it is.
 
-    Parameters
-    ----------
-    model
-        As in `model_of`.
-    gear_ratio
-        Revolutions of the servo for one revolution of the table. All angles and rates of this class are on the table's
-        side of the gear. If the gears reverse the direction, set `table.direction`.
-    guardian
-        Switches the torque off if this program is killed; None if the servo is simulated in this program.
+    ``model`` is as in `model_of`, ``gear_ratio`` the revolutions of the servo for one revolution of the table. All
+    angles and rates of this class are on the table's side of the gear; if it reverses the direction, set
+    `table.direction`. ``guardian`` is None if the servo is simulated in this program.
 
     Raises `DeviceNotFound`: no servo answers at ``bus_id``. `DeviceMismatch`: another model answers. The rig may be
     unable to drive it.

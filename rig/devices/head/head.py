@@ -170,14 +170,8 @@ class RigHead:
 
     Opening it greets the head, compares the clocks, sets the sensor up and starts the stream. The outputs stay off.
 
-    Parameters
-    ----------
-    connection, name, reopen
-        As for `HeadLink`; at `protocol.BAUD`.
-    sensor
-        The sensor on the head's I2C bus, with its settings.
-    deadman_s
-        The silence after which the head switches its outputs off.
+    ``connection``, ``name`` and ``reopen`` are as for `HeadLink`, at `protocol.BAUD`. After a silence of ``deadman_s``
+    the head switches its outputs off.
 
     Raises `DeviceNotFound`, `FirmwareMismatch`: as `HeadLink.greet`. `DeviceSilent`, `DeviceMismatch`: the sensor on
     the head does not answer, or is another one.

@@ -164,16 +164,8 @@ class Deframer:
 class HeadLink:
     """Requests, replies and events on the port of one rig head.
 
-    Parameters
-    ----------
-    connection
-        The open port; its reads return after a few milliseconds.
-    on_event
-        Called with each `Sample` and `StatusChanged` that arrives.
-    name
-        The port's name, for messages.
-    reopen
-        Opens the port again after the cable was unplugged; None if that is not possible.
+    The reads of ``connection`` return after a few milliseconds. ``on_event`` is called with each message that arrives
+    without a request, and ``reopen`` opens the port again after the cable was unplugged; None if that is not possible.
     """
 
     identity: Identity
