@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import ControllerHangs, DeviceFault, DeviceSilent
-from rig.devices.i2c import AnyBus, I2cRegisters, I2cStatistics
-from rig.devices.imu import ImuIdentity, ImuSamples, identified
+from rig.devices.i2c import AnyBus
+from rig.devices.imu import I2cImu, ImuIdentity, ImuSamples, identified
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class _Reading:
     calibrated: bool
 
 
-class Bno055:
+class Bno055(I2cImu):
     """A BNO055; implements `rig.devices.imu.Imu`.
 
     Its samples follow the gyro's readings, and their sum is the rotation of the orientation. Between two readings that
@@ -76,22 +76,8 @@ class Bno055:
     _owed_deg: Floats
 
     def __init__(self, bus: AnyBus, *, clock: Clock, address: int = 0x28) -> None:
-        self._clock = clock
-        self._registers = I2cRegisters(bus, address, clock)
         self._period_ns = round(1e9 / RATE_HZ)
-        try:
-            self.identity = self._identify()
-            self._set_up()
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def statistics(self) -> I2cStatistics:
-        return self._registers.statistics
-
-    def close(self) -> None:
-        self._registers.close()
+        super().__init__(bus, clock, address)
 
     def read_samples(self) -> ImuSamples:
         """Return samples for the time since the last call.

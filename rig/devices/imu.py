@@ -1,5 +1,6 @@
 """The interface of an inertial sensor on the platter, what its drivers share, and opening the configured one."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pkgutil import resolve_name
@@ -13,7 +14,7 @@ from rig.config.imus import ImuKind, imu_kind, likely_device, recognised
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.core.next_steps import Do
-from rig.devices.i2c import AnyBus
+from rig.devices.i2c import AnyBus, I2cRegisters
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +94,28 @@ class FifoTimes:
         time_ns = newest_ns - (newest_ns - self._newest_ns) * np.arange(samples - 1, -1, -1) // steps
         self._newest_ns = newest_ns
         return time_ns
+
+
+class I2cImu:
+    """What the drivers of sensors on an I2C bus of the computer share; if they cannot be opened, the bus is closed."""
+
+    def __init__(self, bus: AnyBus, clock: Clock, address: int) -> None:
+        self._clock = clock
+        self._registers = I2cRegisters(bus, address, clock)
+        self.statistics = self._registers.statistics
+        self.close = self._registers.close
+        try:
+            self.identity = self._identify()
+            self._set_up()
+        except BaseException:
+            self.close()
+            raise
+
+    @abstractmethod
+    def _identify(self) -> ImuIdentity: ...
+
+    @abstractmethod
+    def _set_up(self) -> None: ...
 
 
 def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_rthz: float) -> ImuIdentity:

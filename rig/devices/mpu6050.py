@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rig.config.imus import ImuKind, imu_kind
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, ControllerHangs, DeviceFault, DeviceMismatch, DeviceSilent
-from rig.devices.i2c import AnyBus, I2cRegisters, I2cStatistics
-from rig.devices.imu import FifoTimes, Imu, ImuIdentity, ImuSamples, identified
+from rig.devices.i2c import AnyBus
+from rig.devices.imu import FifoTimes, I2cImu, Imu, ImuIdentity, ImuSamples, identified
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
 _GYRO_CONFIG, _GYRO_SELF_TEST = 0x1B, 0xE0  # all three axes, at 250 °/s
@@ -42,7 +42,7 @@ _SELF_TEST_SAMPLES = 4, 20  # at least, and within a second
 _WILD_DPS = 20.0  # standard deviation that no table at rest shows
 
 
-class Mpu6050:
+class Mpu6050(I2cImu):
     """An MPU-6050; implements `rig.devices.imu.Imu`.
 
     Opening it resets the sensor, wakes it up, writes the settings and reads them back.
@@ -71,22 +71,10 @@ class Mpu6050:
         rate_hz: float = 200.0,
         bandwidth_hz: int = 42,
     ) -> None:
-        self._clock = clock
-        self._address = address
         self._range_dps = range_dps
         self._settings = settings(range_dps, rate_hz, bandwidth_hz)
         self._times = FifoTimes(clock, 1_000_000 * (1 + self._settings[SMPLRT_DIV][0]))
-        self._registers = I2cRegisters(bus, address, clock)
-        try:
-            self.identity = self._identify()
-            self._set_up()
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def statistics(self) -> I2cStatistics:
-        return self._registers.statistics
+        super().__init__(bus, clock, address)
 
     @property
     def rate_hz(self) -> float:
@@ -95,9 +83,6 @@ class Mpu6050:
     @property
     def range_dps(self) -> float:
         return 32767 / LSB_PER_DPS[self._range_dps]
-
-    def close(self) -> None:
-        self._registers.close()
 
     def read_samples(self) -> ImuSamples:
         """Return the samples in the FIFO; `FifoTimes` dates them.
@@ -147,7 +132,7 @@ class Mpu6050:
             raise
         except DeviceSilent as silent:
             raise self._registers.not_found(silent, "AD0 pin (low 0x68, high 0x69)") from silent
-        return identified(self.KIND, got, self._address, self._registers.name, self.NOISE_DPS_RTHZ)
+        return identified(self.KIND, got, self._registers.address, self._registers.name, self.NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
         self._registers.write(_PWR_MGMT_1, _DEVICE_RESET)

@@ -10,7 +10,7 @@ Decision: docs/decisions/0007.
 import importlib
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import log10, prod
 from typing import Any, Final
 
@@ -36,6 +36,13 @@ _SETTLE_FRAMES: Final = 12
 """Frames after which changed settings are certainly in force: sensor and image processor delay them by several."""
 _NOMINAL_FPS: Final = 30.0  # until the frame durations of the sensor's mode are known
 _MANUAL_FOCUS, _CONTINUOUS_FOCUS = 0, 2  # libcamera's AfMode
+_REPORTED: Final[Mapping[int, tuple[str, Callable[[float], Any], Callable[[float], float]]]] = {
+    cv2.CAP_PROP_EXPOSURE: ("ExposureTime", lambda v: round(v * 100), lambda v: max(float(round(v / 100)), 1.0)),
+    cv2.CAP_PROP_GAIN: ("AnalogueGain", lambda v: 10 ** (v / 20), lambda v: max(round(20 * log10(v), 1), 0.0)),
+    cv2.CAP_PROP_WB_TEMPERATURE: ("ColourTemperature", round, lambda v: float(round(v, -1))),
+    cv2.CAP_PROP_FOCUS: ("LensPosition", float, lambda v: round(v, 2)),
+}
+"""Settings that the metadata of a frame report: libcamera's name, what is requested of it, and what a report means."""
 
 
 def camera_number(source: object) -> int | None:
@@ -182,14 +189,9 @@ class Picamera2Capture:
                 return float(self._asked.get("AfMode", _MANUAL_FOCUS) != _MANUAL_FOCUS)
             case cv2.CAP_PROP_SHARPNESS if "Sharpness" in self._controls:
                 return round(float(self._asked.get("Sharpness", self._controls["Sharpness"][2])), 2)
-            case cv2.CAP_PROP_EXPOSURE:
-                return self._reported("ExposureTime", lambda value: max(float(round(value / 100)), 1.0))
-            case cv2.CAP_PROP_GAIN:
-                return self._reported("AnalogueGain", lambda value: max(round(20 * log10(value), 1), 0.0))
-            case cv2.CAP_PROP_WB_TEMPERATURE if "ColourTemperature" in self._controls:
-                return self._reported("ColourTemperature", lambda value: float(round(value, -1)))
-            case cv2.CAP_PROP_FOCUS if "LensPosition" in self._controls:
-                return self._reported("LensPosition", lambda value: round(value, 2))
+            case _ if propId in _REPORTED and _REPORTED[propId][0] in self._controls:
+                name, _, meant = _REPORTED[propId]
+                return self._reported(name, meant)
         return -1.0
 
     def limits(self, propId: int) -> tuple[float, float] | None:
@@ -214,14 +216,9 @@ class Picamera2Capture:
                 return self._control("AwbEnable", bool(value))
             case cv2.CAP_PROP_AUTOFOCUS:
                 return self._control("AfMode", _CONTINUOUS_FOCUS if value else _MANUAL_FOCUS)
-            case cv2.CAP_PROP_EXPOSURE:
-                return self._control("ExposureTime", round(value * 100))
-            case cv2.CAP_PROP_GAIN:
-                return self._control("AnalogueGain", 10 ** (value / 20))
-            case cv2.CAP_PROP_WB_TEMPERATURE:
-                return self._control("ColourTemperature", round(value))
-            case cv2.CAP_PROP_FOCUS:
-                return self._control("LensPosition", value)
+            case _ if propId in _REPORTED:
+                name, requested, _ = _REPORTED[propId]
+                return self._control(name, requested(value))
             case cv2.CAP_PROP_SHARPNESS:
                 return self._control("Sharpness", value)
         return False
@@ -247,7 +244,7 @@ class Picamera2Capture:
             self._settling = True
         return True
 
-    def _reported(self, name: str, converted: Any) -> float:
+    def _reported(self, name: str, meant: Callable[[float], float]) -> float:
         """Return a setting from the metadata of a frame that was exposed with the present settings."""
         if self._open and (self._settling or not self._metadata):
             for _ in range(_SETTLE_FRAMES):
@@ -255,7 +252,7 @@ class Picamera2Capture:
                     break
             self._settling = False
         value = self._metadata.get(name)
-        return -1.0 if value is None else float(converted(value))
+        return -1.0 if value is None else float(meant(value))
 
     def _resize(self, width: int, height: int) -> bool:
         if (width, height) != self._size:

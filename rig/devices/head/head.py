@@ -104,67 +104,6 @@ class HeadStatus:
         )
 
 
-def head_fault(
-    status: HeadStatus, *, port: str, restart: Reset | None, start: Reset, deadman_ms: int
-) -> RigError | None:
-    """Return the error for the reason why the head switched its outputs off; None if it did not.
-
-    ``restart`` is the cause of a restart while the head was in use, ``start`` that of its start before it was opened.
-    """
-    faults = status.faults
-    evidence: dict[str, Any] = {"faults": faults.name, "port": port}
-    if HeadFault.ESTOP in faults:
-        return EmergencyStop(
-            "The e-stop is pressed, or its loop is open: light and servo power are off.",
-            next_step=("Look at the bench, then release the e-stop or repair its cable.", Do.ACKNOWLEDGE()),
-            evidence=evidence,
-        )
-    if restart is not None or faults & (HeadFault.BROWN_OUT | HeadFault.WATCHDOG):
-        cause = start if restart is None else restart
-        return HeadRestarted(
-            f"The rig head at {port} restarted {_RESTARTS[cause]}: light and servo power went off.",
-            next_step=("Check its supply and USB cable.", Do.ACKNOWLEDGE()),
-            evidence={**evidence, "reset_cause": cause.name.lower()},
-        )
-    if HeadFault.DEADMAN in faults:
-        return HeartbeatLost(
-            f"The rig head received nothing from this computer for {deadman_ms} ms: light and servo power are off.",
-            next_step=(
-                "Check whether a program was killed or a cable unplugged. If not, increase head.deadman_s.",
-                Do.ACKNOWLEDGE(),
-            ),
-            evidence={**evidence, "deadman_ms": deadman_ms},
-        )
-    return None
-
-
-def sensor_error(status: HeadStatus, sensor: HeadSensor, port: str) -> RigError:
-    """Return the error for a sensor that does not run."""
-    place = f"I2C address {sensor.setup.address:#04x} of the rig head at {port}"
-    evidence = {"imu_status": status.imu_status.name.lower()}
-    match status.imu_status:
-        case ImuStatus.WRONG_ID | ImuStatus.RUNNING if status.who_am_i not in sensor.kind.identities:
-            return another_sensor(sensor.kind, status.who_am_i, sensor.setup.address, f"the rig head at {port}")
-        case ImuStatus.BUS_STUCK:
-            return DeviceSilent(
-                f"The I2C bus of the rig head at {port} is stuck: SDA or SCL is held low.",
-                next_step="Check SDA and SCL for a short, then switch the sensor's supply off and on.",
-                evidence=evidence,
-            )
-        case ImuStatus.SETTINGS_LOST:
-            return DeviceFault(
-                f"The {sensor.kind.name} at {place} loses its settings: its supply is interrupted.",
-                next_step="Check its supply and cable, then open the bench again.",
-                evidence=evidence,
-            )
-        case _:
-            return DeviceSilent(
-                f"The {sensor.kind.name} at {place} does not answer.",
-                next_step="Check the sensor's plug, supply, SDA and SCL, and its address (imu.address).",
-                evidence=evidence,
-            )
-
-
 class RigHead:
     """An open rig head; implements `rig.devices.imu.Imu`.
 
@@ -314,13 +253,33 @@ class RigHead:
     @property
     def fault(self) -> RigError | None:
         """The reason why the head switched its outputs off; None if it did not."""
-        return head_fault(
-            self._status,
-            port=self._link.name,
-            restart=self._restart,
-            start=Reset(self._link.identity.reset_cause),
-            deadman_ms=self._deadman_ms,
-        )
+        faults, port, restart = self._status.faults, self._link.name, self._restart
+        evidence: dict[str, Any] = {"faults": faults.name, "port": port}
+        if HeadFault.ESTOP in faults:
+            return EmergencyStop(
+                "The e-stop is pressed, or its loop is open: light and servo power are off.",
+                next_step=("Look at the bench, then release the e-stop or repair its cable.", Do.ACKNOWLEDGE()),
+                evidence=evidence,
+            )
+        # A restart while the head was in use, or its start before it was opened.
+        if restart is not None or faults & (HeadFault.BROWN_OUT | HeadFault.WATCHDOG):
+            cause = Reset(self._link.identity.reset_cause) if restart is None else restart
+            return HeadRestarted(
+                f"The rig head at {port} restarted {_RESTARTS[cause]}: light and servo power went off.",
+                next_step=("Check its supply and USB cable.", Do.ACKNOWLEDGE()),
+                evidence={**evidence, "reset_cause": cause.name.lower()},
+            )
+        if HeadFault.DEADMAN in faults:
+            return HeartbeatLost(
+                f"The rig head received nothing from this computer for {self._deadman_ms} ms: light and servo power "
+                "are off.",
+                next_step=(
+                    "Check whether a program was killed or a cable unplugged. If not, increase head.deadman_s.",
+                    Do.ACKNOWLEDGE(),
+                ),
+                evidence={**evidence, "deadman_ms": self._deadman_ms},
+            )
+        return None
 
     def check(self) -> None:
         """Raise the fault for which the head switched its outputs off.
@@ -476,7 +435,31 @@ class RigHead:
             raise self._sensor_error()
 
     def _sensor_error(self) -> RigError:
-        return sensor_error(self._status, self._sensor, self._link.name)
+        """Return the error for a sensor that does not run."""
+        status, sensor, head = self._status, self._sensor, f"the rig head at {self._link.name}"
+        place = f"I2C address {sensor.setup.address:#04x} of {head}"
+        evidence = {"imu_status": status.imu_status.name.lower()}
+        match status.imu_status:
+            case _ if self._another_sensor:
+                return another_sensor(sensor.kind, status.who_am_i, sensor.setup.address, head)
+            case ImuStatus.BUS_STUCK:
+                return DeviceSilent(
+                    f"The I2C bus of {head} is stuck: SDA or SCL is held low.",
+                    next_step="Check SDA and SCL for a short, then switch the sensor's supply off and on.",
+                    evidence=evidence,
+                )
+            case ImuStatus.SETTINGS_LOST:
+                return DeviceFault(
+                    f"The {sensor.kind.name} at {place} loses its settings: its supply is interrupted.",
+                    next_step="Check its supply and cable, then open the bench again.",
+                    evidence=evidence,
+                )
+            case _:
+                return DeviceSilent(
+                    f"The {sensor.kind.name} at {place} does not answer.",
+                    next_step="Check the sensor's plug, supply, SDA and SCL, and its address (imu.address).",
+                    evidence=evidence,
+                )
 
     def _fresh_sample(self) -> Sample:
         """Return a sample that is at most a tenth of a second and a few periods old."""
