@@ -117,7 +117,6 @@ def _wall_map() -> tuple[NDArray[np.int16], int, Image]:
 
 @cache
 def _platter() -> tuple[Image, Image]:
-    """Return the empty platter and its mask."""
     empty = empty_platter()
     return empty, np.where((empty != empty[0, 0]).any(axis=2), 255, 0).astype(np.uint8)
 

@@ -130,8 +130,6 @@ class Chart:
 
 
 class _Scale:
-    """The position of a value on an axis."""
-
     def __init__(self, axis: Axis, low: float, high: float, low_px: float, high_px: float) -> None:
         self._log, self._least, self._low_px = axis.log, low, low_px
         self._low = log10(low) if axis.log else low
@@ -190,7 +188,6 @@ def _without_overlap(ticks: Sequence[tuple[float, str]]) -> Iterator[tuple[float
 
 
 def _draw(series: Series, x: _Scale, y: _Scale) -> list[str]:
-    """Return the band, the curve and the points of one series."""
     parts = []
     if len(series.low) > 0:
         edge = [(x(at), y(low)) for at, low in zip(series.x, series.low, strict=True)]

@@ -132,7 +132,6 @@ def _line_named(text: str, reason: str) -> dict[str, str]:
 
 
 def _apply(values: dict[str, Any], override: str) -> Key:
-    """Apply an override, and return its key."""
     key, sign, text = override.partition("=")
     parts = key.strip().split(".")
     if not sign or not all(parts) or len(parts) > MAX_DEPTH:

@@ -100,7 +100,6 @@ def _camera_delay(context: DoctorContext, calibrations: Iterable[BenchCalibratio
 
 
 def _configured(context: DoctorContext, key: str) -> bool:
-    """Return whether the configuration sets the key."""
     section, _, name = key.partition(".")
     return name in getattr(context.config, section).model_fields_set
 

@@ -177,13 +177,10 @@ def _ask(
 
 
 def _block(parameters: bytes) -> tuple[int, int]:
-    """Return address and size in the parameters of a read."""
     return int.from_bytes(parameters[:2], "little"), int.from_bytes(parameters[2:], "little")
 
 
 class _Servo:
-    """A simulated servo that is compared with a recorded one."""
-
     def __init__(self, bus: DynamixelBus, config: RigConfig, requests: list[_Request]) -> None:
         self.bus, self._id = bus, config.servo.id
         self._table: ControlTable = control_table(config.servo.model)
@@ -231,7 +228,6 @@ class _Servo:
             result.compare(f"servo {name}", t_ns, before, now, 0.0 if now is None else self._tolerances.get(name, 0.0))
 
     def _first(self, requests: list[_Request]) -> dict[str, int]:
-        """Return the first recorded value of each register."""
         answered = [(request, request.reply) for request in requests if request.reply is not None]
         return {name: value for one in reversed(answered) for name, value in self._values(*one)}
 

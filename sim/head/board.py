@@ -52,8 +52,6 @@ class PinChange:
 
 
 class _BoardClock:
-    """The board's own time as a clock."""
-
     def __init__(self, head: "SimHead") -> None:
         self._head = head
 

@@ -72,7 +72,6 @@ def read_objects() -> dict[str, Solid]:
 
 
 def _print(table: Table, others: Mapping[str, Table]) -> tuple[Any, list[Any]]:
-    """Return ground and strokes of a print."""
     ground, strokes = _print(others[table["on"]], others) if "on" in table else (table["ground"], [])
     return ground, [*strokes, *table.get("strokes", ())]
 
@@ -128,7 +127,6 @@ _SHAPES: dict[str, Callable[..., Part]] = {
 
 
 def _curve(pieces: list[Any]) -> Curve:
-    """Return a curve from points and descriptions of curves."""
     points: list[tuple[float, ...]] = []
     for piece in pieces:
         match piece:

@@ -116,7 +116,6 @@ class SimServo:
         return self._status(StatusError.NONE, data) if answers else None
 
     def _perform(self, packet: InstructionPacket) -> bytes:
-        """Execute an instruction; return the data of a read."""
         parameters = packet.parameters
         match packet.instruction:
             case Instruction.PING:
@@ -262,7 +261,6 @@ class SimServo:
         self._schedule(self._supervise, self._clock.now_ns() + round(SUPERVISION_S * 1e9) if varies else None)
 
     def _supply_and_heat(self) -> int:
-        """Return the error bits of the present supply and temperature."""
         motor, memory = self.motor, self.memory
         bits = 0
         if not memory["Min Voltage Limit"] <= motor.supply_v * 10 <= memory["Max Voltage Limit"]:

@@ -81,7 +81,6 @@ def _model(name: str, every: Mapping[str, Any], own: Mapping[str, Any]) -> Servo
 
 
 def _allowed(table: Mapping[str, Any]) -> dict[str, Container[int]]:
-    """Return the valid values of registers."""
     ranges = {name: range(low, high + 1) for name, (low, high) in table.get("ranges", {}).items()}
     return ranges | {name: frozenset(values) for name, values in table.get("choices", {}).items()}
 

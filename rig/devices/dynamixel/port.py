@@ -92,7 +92,6 @@ def _not_opened(path: str, baud: int, device: str, error: Exception, *, guarded:
 
 
 def _is_used_by_guardian(path: str) -> bool:
-    """Return whether a guardian has a port open."""
     port = os.path.realpath(path)
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it ended, or belongs to another user

@@ -435,7 +435,6 @@ class RigHead:
             raise self._sensor_error()
 
     def _sensor_error(self) -> RigError:
-        """Return the error for a sensor that does not run."""
         status, sensor, head = self._status, self._sensor, f"the rig head at {self._link.name}"
         place = f"I2C address {sensor.setup.address:#04x} of {head}"
         evidence = {"imu_status": status.imu_status.name.lower()}

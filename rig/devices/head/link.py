@@ -346,7 +346,6 @@ class HeadLink:
             self._take(self._guarded(lambda: self._connection.read(waiting)))
 
     def _answer(self, message: Request) -> Answer | None:
-        """Return the reply to ``message`` if it has arrived."""
         frame, self._reply = self._reply, None
         answer = None if frame is None else _parse(frame)
         if not isinstance(answer, Done):
