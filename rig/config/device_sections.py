@@ -1,12 +1,14 @@
 """The sections of `rig.toml` for the devices: servo, IMU, rig head and camera."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
 from rig.config.imus import imu_kind
 from rig.config.section import Section
 from rig.config.servos import driven
+
+InCameraUnit = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class ServoConfig(Section):
@@ -123,26 +125,21 @@ class CameraConfig(Section):
         description="locked exposure time; none keeps the camera's own. 10 ms is a period of lamps at 50 Hz mains; use "
         "8333 at 60 Hz",
     )
-    gain: float | None = Field(
-        0.0,
-        ge=0,
-        le=1e6,
-        description="locked gain in the camera's unit, at least its smallest; none keeps the camera's own",
+    gain: InCameraUnit | None = Field(
+        0.0, description="locked gain in the camera's unit, at least its smallest; none keeps the camera's own"
     )
     white_balance_k: float | None = Field(
         5000.0, ge=1000, le=20000, description="locked white balance; none keeps the camera's own"
     )
-    focus: float | None = Field(
+    focus: InCameraUnit | None = Field(
         None,
-        ge=0,
-        le=1e6,
         description="locked focus in the camera's unit; none: the autofocus finds it once, and the bench stores it",
     )
-    sharpness: float | None = Field(
-        None, ge=0, le=1e6, description="sharpness in the camera's unit; none keeps the camera's own"
+    sharpness: InCameraUnit | None = Field(
+        None, description="sharpness in the camera's unit; none keeps the camera's own"
     )
-    backlight_compensation: float | None = Field(
-        None, ge=0, le=1e6, description="backlight compensation in the camera's unit; none keeps the camera's own"
+    backlight_compensation: InCameraUnit | None = Field(
+        None, description="backlight compensation in the camera's unit; none keeps the camera's own"
     )
     power_line_frequency: int | None = Field(
         None,

@@ -121,22 +121,15 @@ class IdentifyConfig(Section):
         "image",
         description="what the catalog records of each answer: with the image of the first view, without, or nothing",
     )
-    margin: float = Field(
+    margin: Fraction = Field(
         0.02,
-        ge=0,
-        le=1,
         description="stop when the best score is certain to lead by this margin for each view; not for dense and hmm",
     )
-    repeatability: float = Field(
-        0.97,
-        ge=0,
-        le=1,
-        description="lowest similarity of the same view after placing the object again, from calibration",
+    repeatability: Fraction = Field(
+        0.97, description="lowest similarity of the same view after placing the object again, from calibration"
     )
-    min_score: float | None = Field(
+    min_score: Fraction | None = Field(
         None,
-        ge=0,
-        le=1,
         description="an object with a lower score per view is unknown; none: from the enrolled views; not for dense",
     )
 

@@ -69,16 +69,10 @@ class TableConfig(Section):
     )
     ringing_damping: float = Field(0.05, ge=0.001, le=0.9, description="damping ratio of that ringing")
     lag_s: float = Field(
-        0.0,
-        ge=0,
-        le=0.3,
-        description="time by which the shaft lags behind the profile, from that calibration",
+        0.0, ge=0, le=0.3, description="time by which the shaft lags behind the profile, from that calibration"
     )
     held_deg: float = Field(
-        0.0,
-        ge=0,
-        le=5,
-        description="distance from its goal at which friction holds the shaft, from that calibration",
+        0.0, ge=0, le=5, description="distance from its goal at which friction holds the shaft, from that calibration"
     )
     quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
