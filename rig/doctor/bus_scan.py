@@ -18,6 +18,7 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import model_of, model_row, obstacle
 from rig.devices.i2c import NO_DEVICE, STUCK, controller_hangs, unbind_command
+from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode
 
 # a scan of all takes long, so the usual ones come first
@@ -89,16 +90,19 @@ def scan_servos(wire: SerialConnection, clock: Clock, bauds: Sequence[int] = BAU
 
 
 def scan_rates(
-    wire: SerialConnection, clock: Clock, rates: Iterable[int], port: str
+    context: DoctorContext, wire: SerialConnection, rates: Iterable[int], port: str
 ) -> Generator[str, None, list[BaudScan]]:
-    """Scan at each baud rate, and yield a text before each; a duplicate id ends the scan."""
+    """Scan at each baud rate, yield a text before each, and return the scans `without_echoes`.
+
+    A duplicate id ends the scan: then it is the last one.
+    """
     scans: list[BaudScan] = []
     for rate in rates:
         yield f"{port}: scanning at {rate} baud ..."
-        scans += scan_servos(wire, clock, [rate])
+        scans += scan_servos(wire, context.computer.clock, [rate])
         if scans and scans[-1].duplicate_ids:
-            break
-    return scans
+            return scans
+    return without_echoes(scans, context.config.servo.baud)
 
 
 def without_echoes(scans: Sequence[BaudScan], preferred: int) -> list[BaudScan]:
@@ -137,7 +141,10 @@ def _scan(port: ClockedPort, baud: int) -> BaudScan:
     port.drain()
     if _babbles(port):
         return BaudScan(baud, noise=True)
-    servos = [_servo(bus_id, baud, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
+    servos = [
+        FoundServo(bus_id, baud, model_of(number), number, firmware)
+        for bus_id, (number, firmware) in sorted(answers.items())
+    ]
     bus = DynamixelBus(port, retries=0)
     duplicate_ids = [
         servo.bus_id for servo in servos if corrupt_reads(bus, servo.bus_id, servo.model) > _STATUS_READS // 2
@@ -151,7 +158,8 @@ def _scan(port: ClockedPort, baud: int) -> BaudScan:
         except (RequestRejected, DeviceSilent):
             duplicate_ids += [bus_id] if _answers_corrupt(bus, bus_id) else []
         else:  # its answer to the broadcast was corrupt, this one is not
-            servos.append(_servo(bus_id, baud, int.from_bytes(head[:2], "little"), head[6]))
+            number = int.from_bytes(head[:2], "little")
+            servos.append(FoundServo(bus_id, baud, model_of(number), number, head[6]))
     sound = tuple(servo for servo in servos if servo.bus_id not in duplicate_ids)
     return BaudScan(baud, sound, tuple(sorted(duplicate_ids)), bool(rest) and not duplicate_ids and not sound)
 
@@ -185,10 +193,6 @@ def _babbles(port: ClockedPort) -> bool:
         if port.ser.read(1):
             return True
     return False
-
-
-def _servo(bus_id: int, baud: int, number: int, firmware: int) -> FoundServo:
-    return FoundServo(bus_id, baud, model_of(number), number, firmware)
 
 
 def _answers_corrupt(bus: DynamixelBus, bus_id: int) -> bool:

@@ -47,7 +47,7 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
     """Open the camera, lock its settings, and take some frames."""
     with closing(open_camera(context)) as source:
         identity = source.identity
-        context.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+        context.identities["camera"] = asdict(identity)
         mode = {"name": identity.name, "width": identity.width, "height": identity.height, "fps": identity.fps}
         yield FindingCode.CAMERA(**mode)
         yield FindingCode.TIME_BASE(time_base=source.time_base.value)

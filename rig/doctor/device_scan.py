@@ -27,13 +27,12 @@ from rig.doctor.bus_scan import (
     scan_rates,
     unusable_address,
     use_another_imu,
-    without_echoes,
 )
 from rig.doctor.computer import access, i2c_command
 from rig.doctor.context import DoctorContext
 from rig.doctor.examination import Check
 from rig.doctor.finding import Finding, FindingCode, Severity, of_error
-from rig.doctor.servo import duplicate_id, foreign_bytes
+from rig.doctor.servo import duplicate_id
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +132,8 @@ class DeviceScan:
 
     def _servos(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
         with closing(context.computer.open_serial(port.path, BAUD_RATES[0])) as wire:
-            answered = yield from scan_rates(wire, context.computer.clock, BAUD_RATES, port.path)
-        for scan in without_echoes(answered, context.config.servo.baud):
+            answered = yield from scan_rates(context, wire, BAUD_RATES, port.path)
+        for scan in answered:
             yield from self._found(port, scan)
         return any(scan.answered for scan in answered)
 
@@ -176,7 +175,7 @@ class DeviceScan:
             self.duplicate_ids = True
             yield duplicate_id(port.path, scan)
         if scan.noise:
-            yield foreign_bytes(port.path, scan)
+            yield FindingCode.FOREIGN_BYTES(port=port.path, baud=scan.baud)
 
     def find_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
         asked = 0

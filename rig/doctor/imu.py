@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ def _at_rest(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
     identity = sensor.identity
     if note := imu_kind(context.config.imu.model).note:
         yield FindingCode.IMU_NOTE(note=note)
-    context.identities["imu"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+    context.identities["imu"] = asdict(identity)
     yield from _rest(context, sensor, _samples(context, sensor))
     yield from _gravity(context, sensor)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import asdict
 from typing import Any
 
 from rig.config import ServoConfig
@@ -18,7 +19,7 @@ from rig.devices.dynamixel.registers import (
 )
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
-from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates, scan_servos
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, Severity, graded, of_error
 
@@ -58,7 +59,7 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
             yield of_error(error)
             return
         identity = found.identity
-        context.identities["servo"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+        context.identities["servo"] = asdict(identity)
         name = identity.model.replace("_", "-").upper()
         yield FindingCode.SERVO(model=name, firmware=identity.firmware, **_place(config))
         if isinstance(found, DynamixelServo):
@@ -73,11 +74,11 @@ def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Find
     """Scan the other baud rates, because the configured servo does not answer."""
     config = context.config.servo
     rates = (config.baud, *(rate for rate in BAUD_RATES if rate != config.baud))
-    answered = yield from scan_rates(wire, context.computer.clock, rates, config.port)
+    answered = yield from scan_rates(context, wire, rates, config.port)
     if answered and answered[-1].duplicate_ids:
         yield duplicate_id(config.port, answered[-1])
         return
-    there = [found for scan in without_echoes(answered, config.baud) for found in scan.servos]
+    there = [found for scan in answered for found in scan.servos]
     if not there:
         yield FindingCode.NO_SERVO(**_place(config))
         return
@@ -110,7 +111,7 @@ def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[F
         if scan.duplicate_ids:
             yield duplicate_id(config.port, scan)
         elif scan.noise:
-            yield foreign_bytes(config.port, scan)
+            yield FindingCode.FOREIGN_BYTES(port=config.port, baud=scan.baud)
         elif others:
             yield FindingCode.MORE_SERVOS(found=others)
         else:
@@ -123,11 +124,6 @@ def duplicate_id(port: str, scan: BaudScan) -> Finding:
     free_id = next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
     fix = ("Unplug one of the two, then", Do.SERVO_ID(id=free_id))
     return FindingCode.DUPLICATE_ID(fix, port=port, ids=scan.duplicate_ids, baud=scan.baud)
-
-
-def foreign_bytes(port: str, scan: BaudScan) -> Finding:
-    """Return the finding that bytes of no servo arrive."""
-    return FindingCode.FOREIGN_BYTES(port=port, baud=scan.baud)
 
 
 def _settings(found: DynamixelServo) -> Iterator[Finding]:

@@ -11,7 +11,7 @@ from rig.core.next_steps import Do
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import ControlTable, control_table, require_driven
-from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates
 from rig.doctor.context import DoctorContext
 
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
@@ -139,14 +139,14 @@ def _scanned(scan: Generator[str, None, list[BaudScan]], progress: Callable[[str
 
 def _find_only_servo(context: DoctorContext, wire: SerialConnection, progress: Callable[[str], None]) -> FoundServo:
     """Scan all baud rates: a second servo at another rate would answer as soon as the rates are equal."""
-    scans = _scanned(scan_rates(wire, context.computer.clock, BAUD_RATES, context.config.servo.port), progress)
+    scans = _scanned(scan_rates(context, wire, BAUD_RATES, context.config.servo.port), progress)
     if scans and (ids := scans[-1].duplicate_ids):
         raise SeveralServos(
             f"Two servos answer at once to id {', '.join(map(str, ids))} at {scans[-1].baud} baud.",
             next_step="Unplug all other servos, then try again.",
             evidence={"ids": list(ids), "baud": scans[-1].baud},
         )
-    found = [servo for scan in without_echoes(scans, context.config.servo.baud) for servo in scan.servos]
+    found = [servo for scan in scans for servo in scan.servos]
     if not found:
         raise DeviceNotFound(
             f"No servo answers on {context.config.servo.port} at any baud rate.",
