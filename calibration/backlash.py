@@ -126,14 +126,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
             not RATIO[0] < ratio < RATIO[1], RejectionCode.WRONG_GEAR_RATIO, ratio=ratio, table_deg=1 / ratio
         )
     reject_slipped_leg(found, legs.index(used[worst]) + 1)
-    found.reject_if(
-        backlash > MAX_BACKLASH_DEG, RejectionCode.BACKLASH_TOO_LARGE, backlash_deg=backlash, limit_deg=MAX_BACKLASH_DEG
-    )
+    found.reject_above(MAX_BACKLASH_DEG, RejectionCode.BACKLASH_TOO_LARGE, backlash_deg=backlash)
     found.reject_if(backlash < -COVERAGE * backlash_sigma, RejectionCode.BACKLASH_NEGATIVE, backlash_deg=backlash)
-    found.reject_if(
-        backlash_sigma > MAX_UNCERTAINTY_DEG,
-        RejectionCode.BACKLASH_UNCERTAIN,
-        uncertainty_deg=backlash_sigma,
-        limit_deg=MAX_UNCERTAINTY_DEG,
-    )
+    found.reject_above(MAX_UNCERTAINTY_DEG, RejectionCode.BACKLASH_UNCERTAIN, uncertainty_deg=backlash_sigma)
     return found

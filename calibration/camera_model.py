@@ -154,24 +154,13 @@ def evaluate(
         for r, t in zip(rotations, translations, strict=True)
     ]
     reject_loose_board(found, views, poses)
-    found.reject_if(
-        found.residual > MAX_RMS_PX,
-        RejectionCode.CORNERS_OFF,
-        rms_px=found.residual,
-        view=int(np.argmax(view_rms)) + 1,
-        view_px=np.max(view_rms),
-        limit_px=MAX_RMS_PX,
-    )
+    worst = {"view": int(np.argmax(view_rms)) + 1, "view_px": np.max(view_rms)}
+    found.reject_above(MAX_RMS_PX, RejectionCode.CORNERS_OFF, rms_px=found.residual, **worst)
     covered = float((cells > 0).mean())
     found.reject_if(covered < MIN_COVERAGE, RejectionCode.COVERAGE_TOO_SMALL, covered=covered, needed=MIN_COVERAGE)
     focal = found.estimates["fx"]
     uncertainty = focal.uncertainty / focal.value
-    found.reject_if(
-        uncertainty > MAX_FOCAL_UNCERTAINTY,
-        RejectionCode.FOCAL_LENGTH_UNCERTAIN,
-        uncertainty=uncertainty,
-        limit=MAX_FOCAL_UNCERTAINTY,
-    )
+    found.reject_above(MAX_FOCAL_UNCERTAINTY, RejectionCode.FOCAL_LENGTH_UNCERTAIN, uncertainty=uncertainty)
     return found
 
 

@@ -308,7 +308,7 @@ class CameraTime(Procedure):
         share = lost / max(lost + frames, 1)
         found = evaluate(passes, exposure_ms=config.camera.exposure_us * 1e-3, fastest_dps=max(speeds_dps), bench=bench)
         found.reject_if(worst_deg > SLIP_DEG, RejectionCode.PLATTER_SLIPPED, residual_deg=worst_deg)
-        found.reject_if(share > MAX_LOST, RejectionCode.FRAMES_LOST, lost=share, limit=MAX_LOST)
+        found.reject_above(MAX_LOST, RejectionCode.FRAMES_LOST, lost=share)
         if found.estimates:
             sigma = sqrt(max(share, 1 / (frames + 1)) / (frames + 1))
             found.estimate(
@@ -428,18 +428,7 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
         uncertainty_deg=scatter_deg,
         needed_deg=MAX_ANGLE_DEG,
     )
-    found.reject_if(
-        offset.uncertainty > MAX_UNCERTAINTY_MS,
-        RejectionCode.FRAME_TIME_UNCERTAIN,
-        uncertainty_ms=offset.uncertainty,
-        limit_ms=MAX_UNCERTAINTY_MS,
-    )
-    found.reject_if(
-        jitter_s * fastest_dps > limit_deg,
-        RejectionCode.FRAME_JITTER_TOO_LARGE,
-        jitter_ms=jitter_s * 1e3,
-        speed_dps=fastest_dps,
-        jitter_deg=jitter_s * fastest_dps,
-        limit_deg=limit_deg,
-    )
+    found.reject_above(MAX_UNCERTAINTY_MS, RejectionCode.FRAME_TIME_UNCERTAIN, uncertainty_ms=offset.uncertainty)
+    jitter = {"jitter_deg": jitter_s * fastest_dps, "jitter_ms": jitter_s * 1e3, "speed_dps": fastest_dps}
+    found.reject_above(limit_deg, RejectionCode.FRAME_JITTER_TOO_LARGE, **jitter)
     return found

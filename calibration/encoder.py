@@ -140,15 +140,9 @@ def evaluate(steps: Sequence[Step], *, direction: int, revolution_deg: float, re
 
     largest = float(np.abs(_basis(np.linspace(0.0, revolution_deg, 361), revolution_deg) @ fitted.values[1:]).max())
     reject_slipped_leg(found, steps.index(used[fitted.worst]) + 1)
-    found.reject_if(
-        largest > MAX_ERROR_DEG, RejectionCode.ENCODER_ERROR_TOO_LARGE, error_deg=largest, limit_deg=MAX_ERROR_DEG
-    )
-    found.reject_if(
-        (uncertainty := max(one.uncertainty for one in found.estimates.values())) > MAX_UNCERTAINTY_DEG,
-        RejectionCode.ENCODER_UNCERTAIN,
-        uncertainty_deg=uncertainty,
-        limit_deg=MAX_UNCERTAINTY_DEG,
-    )
+    found.reject_above(MAX_ERROR_DEG, RejectionCode.ENCODER_ERROR_TOO_LARGE, error_deg=largest)
+    uncertainty = max(one.uncertainty for one in found.estimates.values())
+    found.reject_above(MAX_UNCERTAINTY_DEG, RejectionCode.ENCODER_UNCERTAIN, uncertainty_deg=uncertainty)
     return found
 
 

@@ -138,9 +138,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
         up=value_up,
         down=value_down,
     )
-    found.reject_if(
-        uncertainty > MAX_UNCERTAINTY, RejectionCode.SCALE_UNCERTAIN, uncertainty=uncertainty, limit=MAX_UNCERTAINTY
-    )
+    found.reject_above(MAX_UNCERTAINTY, RejectionCode.SCALE_UNCERTAIN, uncertainty=uncertainty)
     return found
 
 

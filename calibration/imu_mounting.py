@@ -204,7 +204,7 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
     found.estimates |= _levels(levels, axis, column, tilts)
     found.estimates["delay"] = _delay(moves)
     level_deg = hypot(found.estimates["axis_x"].value, found.estimates["axis_y"].value)
-    found.reject_if(level_deg > MAX_LEVEL_DEG, RejectionCode.NOT_LEVEL, level_deg=level_deg, limit_deg=MAX_LEVEL_DEG)
+    found.reject_above(MAX_LEVEL_DEG, RejectionCode.NOT_LEVEL, level_deg=level_deg)
     return found
 
 

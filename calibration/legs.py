@@ -125,7 +125,5 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
 
 def reject_slipped_leg(found: Evaluation, number: int) -> None:
     """Reject an evaluation whose largest residual, that of leg ``number`` (from 1), is above its limit."""
-    assert found.residual is not None
     assert found.limit is not None
-    code, residual_deg, limit_deg = RejectionCode.LEG_SLIPPED, found.residual, found.limit
-    found.reject_if(residual_deg > limit_deg, code, leg=number, residual_deg=residual_deg, limit_deg=limit_deg)
+    found.reject_above(found.limit, RejectionCode.LEG_SLIPPED, residual_deg=found.residual, leg=number)

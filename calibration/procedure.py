@@ -71,6 +71,12 @@ class Evaluation:
         if condition:
             self.reject(code, **values)
 
+    def reject_above(self, limit: float, code: RejectionCode, **values: Any) -> None:
+        """Add a rejection if the first of its numbers is above a limit: the words get ``rms_px`` and ``limit_px``."""
+        name, value = next(iter(values.items()))
+        unit = name.partition("_")[2]
+        self.reject_if(value > limit, code, **values, **{f"limit_{unit}" if unit else "limit": limit})
+
     def reject(self, code: RejectionCode, **values: Any) -> Self:
         """Add a rejection with the numbers that its words need, and return the evaluation."""
         self.rejections.append(rejection(code, values))

@@ -386,16 +386,9 @@ def _from_lens(estimates: Mapping[str, Estimate]) -> float:
 
 def _check(found: Evaluation, board: CharucoBoard, space: ObjectSpace) -> None:
     """Reject a poor fit, a wobbling axis, and a board whose size contradicts the measured distance."""
-    found.reject_if(
-        (found.residual or 0.0) > MAX_RMS_PX, RejectionCode.CIRCLES_OFF, rms_px=found.residual, limit_px=MAX_RMS_PX
-    )
+    found.reject_above(MAX_RMS_PX, RejectionCode.CIRCLES_OFF, rms_px=found.residual)
     uncertainty = max(found.estimates["px"].uncertainty, found.estimates["py"].uncertainty)
-    found.reject_if(
-        uncertainty > MAX_UNCERTAINTY_PX,
-        RejectionCode.AXIS_UNCERTAIN,
-        uncertainty_px=uncertainty,
-        limit_px=MAX_UNCERTAINTY_PX,
-    )
+    found.reject_above(MAX_UNCERTAINTY_PX, RejectionCode.AXIS_UNCERTAIN, uncertainty_px=uncertainty)
     wobble = found.estimates["wobble"]
     found.reject_if(
         wobble.value - 2 * wobble.uncertainty > MAX_WOBBLE_DEG,

@@ -1,6 +1,7 @@
 """The settings of the simulated camera, in the units of OpenCV's V4L2 backend."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 
@@ -12,12 +13,23 @@ NOMINAL_EXPOSURE = 100  # exposure at which the frame has the scene's grey level
 V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY = 1, 3
 # The ranges and defaults of a usual UVC webcam. The longest exposure is the time between two frames.
 EXPOSURE_RANGE = (1, 10_000 // FPS)
-_GAIN_RANGE_DB = (0, 24)
 KELVIN_RANGE = (2800, 6500)
-_FOCUS_RANGE = (0, 255)
 SHARP_AT = 120
-_SHARPNESS_RANGE = (0, 255)
 BUFFERS_RANGE = (1, 10)
+_SWITCHES = {
+    cv2.CAP_PROP_AUTO_WB: "auto_white_balance",
+    cv2.CAP_PROP_AUTOFOCUS: "autofocus",
+    v4l2.EXPOSURE_DYNAMIC_FRAMERATE: "dynamic_frame_rate",
+}
+_NUMBERS: dict[int, tuple[str, tuple[int, int], str]] = {
+    cv2.CAP_PROP_EXPOSURE: ("exposure", EXPOSURE_RANGE, "auto_exposure"),
+    cv2.CAP_PROP_GAIN: ("gain_db", (0, 24), ""),
+    cv2.CAP_PROP_WB_TEMPERATURE: ("kelvin", KELVIN_RANGE, "auto_white_balance"),
+    cv2.CAP_PROP_FOCUS: ("focus", (0, 255), "autofocus"),
+    cv2.CAP_PROP_SHARPNESS: ("sharpness", (0, 255), ""),
+    cv2.CAP_PROP_BACKLIGHT: ("backlight_compensation", (0, 1), ""),
+}
+"""Fields of `Controls` by property; of a number its range, and the automatic that keeps programs from setting it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,19 +62,14 @@ class Controls:
     @property
     def values(self) -> dict[int, float]:
         """The values that OpenCV reads."""
-        return {
+        read = {prop: getattr(self, name) for prop, name in _SWITCHES.items()}
+        read |= {prop: getattr(self, name) for prop, (name, *_) in _NUMBERS.items()}
+        return read | {
             cv2.CAP_PROP_BUFFERSIZE: self.buffers,
             cv2.CAP_PROP_AUTO_EXPOSURE: V4L2_EXPOSURE_APERTURE_PRIORITY if self.auto_exposure else V4L2_EXPOSURE_MANUAL,
-            cv2.CAP_PROP_EXPOSURE: round(self.exposure),
-            cv2.CAP_PROP_GAIN: self.gain_db,
-            cv2.CAP_PROP_AUTO_WB: self.auto_white_balance,
+            cv2.CAP_PROP_EXPOSURE: round(self.exposure),  # the automatics change it by less than a step
             cv2.CAP_PROP_WB_TEMPERATURE: round(self.kelvin),
-            cv2.CAP_PROP_AUTOFOCUS: self.autofocus,
-            cv2.CAP_PROP_FOCUS: self.focus,
-            cv2.CAP_PROP_SHARPNESS: self.sharpness,
-            cv2.CAP_PROP_BACKLIGHT: self.backlight_compensation,
             v4l2.POWER_LINE_FREQUENCY: self.power_line_frequency,
-            v4l2.EXPOSURE_DYNAMIC_FRAMERATE: self.dynamic_frame_rate,
         }
 
     def with_value(self, prop: int, value: float) -> "Controls | None":
@@ -71,30 +78,18 @@ class Controls:
             case cv2.CAP_PROP_AUTO_EXPOSURE if value in (V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY):
                 auto = value == V4L2_EXPOSURE_APERTURE_PRIORITY
                 return replace(self, auto_exposure=auto, exposure=round(self.exposure))
-            case cv2.CAP_PROP_EXPOSURE if not self.auto_exposure:
-                return replace(self, exposure=_within(value, EXPOSURE_RANGE))
-            case cv2.CAP_PROP_GAIN:
-                return replace(self, gain_db=_within(value, _GAIN_RANGE_DB))
             case cv2.CAP_PROP_AUTO_WB:
                 return replace(self, auto_white_balance=bool(value), kelvin=round(self.kelvin))
-            case cv2.CAP_PROP_WB_TEMPERATURE if not self.auto_white_balance:
-                return replace(self, kelvin=_within(value, KELVIN_RANGE))
-            case cv2.CAP_PROP_AUTOFOCUS:
-                return replace(self, autofocus=bool(value))
-            case cv2.CAP_PROP_FOCUS if not self.autofocus:
-                return replace(self, focus=_within(value, _FOCUS_RANGE))
-            case cv2.CAP_PROP_SHARPNESS:
-                return replace(self, sharpness=_within(value, _SHARPNESS_RANGE))
-            case cv2.CAP_PROP_BACKLIGHT:
-                return replace(self, backlight_compensation=_within(value, (0, 1)))
             case v4l2.POWER_LINE_FREQUENCY if 0 <= value <= 2:
                 return replace(self, power_line_frequency=int(value))
-            case v4l2.EXPOSURE_DYNAMIC_FRAMERATE:
-                return replace(self, dynamic_frame_rate=bool(value))
+            case _ if prop in _SWITCHES:
+                return replace(self, **{_SWITCHES[prop]: bool(value)})
+            case _ if prop in _NUMBERS:
+                name, (low, high), automatic = _NUMBERS[prop]
+                if automatic and getattr(self, automatic):
+                    return None
+                # V4L2 takes a whole number, and brings it into the range.
+                taken: dict[str, Any] = {name: int(min(max(int(value), low), high))}
+                return replace(self, **taken)
             case _:
                 return None
-
-
-def _within(value: float, limits: tuple[int, int]) -> int:
-    """Return ``value`` as V4L2 takes it: a whole number, brought into the range."""
-    return int(min(max(int(value), limits[0]), limits[1]))
