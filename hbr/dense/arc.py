@@ -49,19 +49,14 @@ STEP_WEIGHT: Final = STEP_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
 
 
 class ArcSession(DenseSession):
-    """A search in motion.
-
-    Attributes
-    ----------
-    decisions : int
-        Number of decisions so far; the first view is the first one.
-    """
+    """A search in motion."""
 
     _NEWEST = 4  # 60°: the frames of fewer steps are hardly enough evidence of a change
 
     def __init__(self, index: DenseIndex, *, most_changes: int = MOST_CHANGES) -> None:
         super().__init__(index, max_views=DECISIONS, most_changes=most_changes)
         self.decisions = 0
+        """Number of decisions so far; the first view is the first one."""
         self._covered_deg = 0.0
 
     def _forget(self) -> None:

@@ -24,27 +24,19 @@ BETA: Final = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """The support of all views so far for every object at every azimuth.
-
-    Attributes
-    ----------
-    index : DenseIndex
-        The enrolled views of the objects that are still considered.
-    support : float32 array (k, 72)
-        A, the sum of the support that each query adds; for azimuths 0, 5, ... at the first query.
-    orientation_deg : float64 array (n,)
-        Orientations of the camera around the object at the queries, from any zero.
-    weights : float64 array (n,), or None
-        How much each query counts, 0..1; None: all count fully.
-    vectors : tuple of float32 arrays (h, d)
-        The queries in the index's space.
-    """
+    """The support of all views so far for every object at every azimuth."""
 
     index: DenseIndex
+    """The enrolled views of the objects that are still considered."""
     support: Floats
+    """float32 array (k, 72): A, the sum of the support that each query adds; for azimuths 0, 5, ... at the first
+    query."""
     orientation_deg: FloatArray
+    """float64 array (n,): orientations of the camera around the object at the queries, from any zero."""
     weights: FloatArray | None = None
+    """float64 array (n,), or None: how much each query counts, 0..1; None: all count fully."""
     vectors: tuple[Floats, ...] = ()
+    """tuple of float32 arrays (h, d): the queries in the index's space."""
 
     @property
     def queries(self) -> int:
@@ -101,18 +93,12 @@ class Belief:
 
 @dataclass(frozen=True, eq=False)
 class DenseRanking:
-    """The objects that the filter considers, best first.
-
-    Attributes
-    ----------
-    object_index : integer array (k,)
-        Equal scores by lower index.
-    scores : float64 array (k,)
-        As `Belief.scores`.
-    """
+    """The objects that the filter considers, best first."""
 
     object_index: IndexArray
+    """integer array (k,): equal scores by lower index."""
     scores: FloatArray
+    """float64 array (k,): as `Belief.scores`."""
 
 
 def update_belief(

@@ -34,20 +34,7 @@ _FAR_DEG: Final = 2000.0
 
 
 class DenseIndex:
-    """Enrolled views, prepared for the dense filter.
-
-    Parameters
-    ----------
-    views : Views
-        Of any descriptor. Objects without views are left out.
-    omega : float
-        Weight ω of the orientation, per revolution.
-
-    Attributes
-    ----------
-    space : Space
-        The space in which views are compared; an index of a part of the views has the space of all.
-    """
+    """Enrolled views, prepared for the dense filter."""
 
     def __init__(self, views: Views, *, omega: float = OMEGA) -> None:
         if not (np.isfinite(omega) and omega >= 0):
@@ -55,8 +42,11 @@ class DenseIndex:
         if not len(views):
             raise ValueError("there are no views; enroll at least one object first")
         self.views = views
+        """Of any descriptor. Objects without views are left out."""
         self.omega = omega
+        """Weight ω of the orientation, per revolution."""
         self.space = Space(views)
+        """The space in which views are compared; an index of a part of the views has the space of all."""
         self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
         order, begin = views.of_each(self.object_index)
         count = lengths(begin, len(order))

@@ -37,31 +37,23 @@ Hypotheses = tuple[FloatArray, IndexArray, IndexArray]
 
 @dataclass(frozen=True, eq=False)
 class NextBestView:
-    """A rotation, or an arc of a search in motion, and the numbers of the decision for it.
-
-    Attributes
-    ----------
-    rotation_deg : float
-        Rotation of the camera around the object, counter-clockwise.
-    orientation_deg : float
-        The orientation after it, from the zero of the queries' orientations, in [0, 360).
-    pair : (int, int) or None
-        The two objects that it separates most: index of each in the views' names, the likelier first. None if the
-        strongest hypotheses are all of one object.
-    rotations_deg, confusion, cost : float64 arrays (a,)
-        All rotations that were weighed; the logarithm of the probability that two objects are still confused after
-        each; the cost of the motion, in the same unit.
-    similarity : float64 array (a,), or None
-        Similarity of the pair's views after each rotation; None if there is no pair, and for an arc.
-    """
+    """A rotation, or an arc of a search in motion, and the numbers of the decision for it."""
 
     rotation_deg: float
+    """Rotation of the camera around the object, counter-clockwise."""
     orientation_deg: float
+    """The orientation after it, from the zero of the queries' orientations, in [0, 360)."""
     pair: tuple[int, int] | None
+    """(int, int) or None: the two objects that it separates most: index of each in the views' names, the likelier
+    first. None if the strongest hypotheses are all of one object."""
     rotations_deg: FloatArray
     confusion: FloatArray
     cost: FloatArray
+    """float64 arrays (a,): all rotations that were weighed; the logarithm of the probability that two objects are still
+    confused after each; the cost of the motion, in the same unit."""
     similarity: FloatArray | None
+    """float64 array (a,), or None: similarity of the pair's views after each rotation; None if there is no pair, and
+    for an arc."""
 
 
 def next_best_view(
@@ -153,24 +145,16 @@ def _with_what_was_seen(
 
 
 class Pairs(NamedTuple):
-    """The pairs of strong hypotheses of different objects, and what their views show after some rotations.
-
-    Attributes
-    ----------
-    objects : integer array (2, p)
-        Index of both objects of each pair in the views' names, the likelier hypothesis first.
-    probability : float64 array (p,)
-        Product of their probabilities.
-    similar : float64 array (a, p)
-        Similarity of their views after each rotation.
-    known : float64 array (a, p)
-        √(κ κ'), 0..1: to which share their views are known (`next_best_view`).
-    """
+    """The pairs of strong hypotheses of different objects, and what their views show after some rotations."""
 
     objects: IndexArray
+    """integer array (2, p): index of both objects of each pair in the views' names, the likelier hypothesis first."""
     probability: FloatArray
+    """float64 array (p,): product of their probabilities."""
     similar: FloatArray
+    """float64 array (a, p): similarity of their views after each rotation."""
     known: FloatArray
+    """float64 array (a, p): √(κ κ'), 0..1: to which share their views are known (`next_best_view`)."""
 
     def named(self, place: int) -> tuple[int, int]:
         """Return the two objects of the pair at this place."""

@@ -42,40 +42,27 @@ _FEWEST: Final = 60
 
 @dataclass(frozen=True, eq=False)
 class LocalView:
-    """A view for the comparison.
-
-    Attributes
-    ----------
-    crop : uint8 array (160, 160, 3)
-        As `hbr.Segmentation.crop`.
-    mask : uint8 array (160, 160)
-        As `hbr.Segmentation.mask`.
-    azimuth_deg : float
-        Orientation of the camera around the object; for a view of a search, from any zero that its views share.
-    """
+    """A view for the comparison."""
 
     crop: ImageArray
+    """uint8 array (160, 160, 3): as `hbr.Segmentation.crop`."""
     mask: Mask
+    """uint8 array (160, 160): as `hbr.Segmentation.mask`."""
     azimuth_deg: float
+    """Orientation of the camera around the object; for a view of a search, from any zero that its views share."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """A view, prepared.
-
-    Attributes
-    ----------
-    colours : float32 array (64, 64, 3)
-        Logarithms of the brightness and of two ratios of the colours.
-    mask : uint8 array (64, 64)
-        Share of each pixel that belongs to the object, 0..255.
-    alone : float32 array (32, 32)
-        The logarithm of the brightness at half the size, with its mean instead of the background.
-    """
+    """A view, prepared."""
 
     colours: Map
+    """float32 array (64, 64, 3): logarithms of the brightness and of two ratios of the colours."""
     mask: Mask
+    """uint8 array (64, 64): share of each pixel that belongs to the object, 0..255."""
     alone: Map
+    """float32 array (32, 32): the logarithm of the brightness at half the size, with its mean instead of the
+    background."""
 
     @classmethod
     def of(cls, view: LocalView) -> "Pixels":
@@ -95,25 +82,17 @@ class Pixels:
 
 
 class PixelFit(NamedTuple):
-    """The fit of the leading candidates of a search to its views, at most 1.
-
-    Attributes
-    ----------
-    object_index : int
-        The leader, after the comparison, as an index of the views' names.
-    own, second : float
-        Mean fit of the leader, and of the other one of the two likeliest candidates; 0 without one.
-    others : float
-        The best mean fit of the next candidates that are no near twins of the leader; 0 without one.
-    expected : float
-        Mean fit of the two enrolled views of the leader beside each view to each other.
-    """
+    """The fit of the leading candidates of a search to its views, at most 1."""
 
     object_index: int
+    """The leader, after the comparison, as an index of the views' names."""
     own: float
     second: float
+    """Mean fit of the leader, and of the other one of the two likeliest candidates; 0 without one."""
     others: float
+    """The best mean fit of the next candidates that are no near twins of the leader; 0 without one."""
     expected: float
+    """Mean fit of the two enrolled views of the leader beside each view to each other."""
 
 
 def fit(view: Pixels, enrolled: Pixels) -> float:

@@ -49,22 +49,15 @@ _DEGREES: Final = np.arange(360.0)
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Orientation of the camera around an object at the last query, if the views determine it.
-
-    Attributes
-    ----------
-    azimuth_deg : tuple of float
-        All azimuths that are equally likely, the estimated one first: one without symmetry, n if the object looks the
-        same every 360° / n, none if no azimuth is determined.
-    sigma_deg : float, optional
-        Standard uncertainty of each; None if no azimuth is determined.
-    period_deg : float, optional
-        360 without symmetry, 360 / n, 0 if the object looks the same from all sides; None if that is not known.
-    """
+    """Orientation of the camera around an object at the last query, if the views determine it."""
 
     azimuth_deg: tuple[float, ...]
+    """All azimuths that are equally likely, the estimated one first: one without symmetry, n if the object looks the
+    same every 360° / n, none if no azimuth is determined."""
     sigma_deg: float | None
+    """Standard uncertainty of each; None if no azimuth is determined."""
     period_deg: float | None
+    """360 without symmetry, 360 / n, 0 if the object looks the same from all sides; None if that is not known."""
 
 
 def pose(belief: Belief, object_index: int) -> Pose:

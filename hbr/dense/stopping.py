@@ -63,28 +63,19 @@ class StopReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopDecision:
-    """The decision after a view, and the probabilities that it follows from.
-
-    Attributes
-    ----------
-    outcome, reason
-        What to do, and why.
-    object_index : int
-        The leading candidate, for every outcome.
-    probability : float
-        That it is the object on the table.
-    not_enrolled : float
-        Probability that the object on the table is not enrolled.
-    min_confidence : float
-        Probability that ends a search.
-    """
+    """The decision after a view, and the probabilities that it follows from."""
 
     outcome: Outcome
     reason: StopReason
+    """What to do, and why."""
     object_index: int
+    """The leading candidate, for every outcome."""
     probability: float
+    """That it is the object on the table."""
     not_enrolled: float
+    """Probability that the object on the table is not enrolled."""
     min_confidence: float
+    """Probability that ends a search."""
 
 
 def posterior(belief: Belief, fit: PixelFit | None = None, *, other_bench: bool = False) -> tuple[FloatArray, float]:
@@ -171,19 +162,14 @@ _TINY: Final = 1e-12
 
 
 class _Network(NamedTuple):
-    """A network with one hidden layer.
-
-    Attributes
-    ----------
-    inner, outer : float64 arrays (numbers + 1, units) and (units,)
-        Weights of the hidden layer, with an offset for each unit, and of its units.
-    direct : float64 array (numbers + 1,)
-        Weights of the numbers themselves, and an offset.
-    """
+    """A network with one hidden layer."""
 
     inner: FloatArray
     outer: FloatArray
+    """float64 arrays (numbers + 1, units) and (units,): weights of the hidden layer, with an offset for each unit, and
+    of its units."""
     direct: FloatArray
+    """float64 array (numbers + 1,): weights of the numbers themselves, and an offset."""
 
     def __call__(self, found: Sequence[float]) -> float:
         given = np.array([*found, 1.0])
@@ -191,19 +177,13 @@ class _Network(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """The model for one descriptor.
-
-    Attributes
-    ----------
-    alone, with_fit : _Network
-        Return the log-odds that the leader is on the table, without a fit and with one.
-    is_common : bool
-        Whether the numbers are only those that do not depend on the parts of a descriptor.
-    """
+    """The model for one descriptor."""
 
     alone: _Network
     with_fit: _Network
+    """Return the log-odds that the leader is on the table, without a fit and with one."""
     is_common: bool
+    """Whether the numbers are only those that do not depend on the parts of a descriptor."""
 
     def log_odds(self, found: Sequence[float], fit: PixelFit | None) -> float:
         if fit is None:

@@ -440,14 +440,7 @@ _BLOCKS: Final = 40
 
 @dataclass(frozen=True)
 class Cedd(Descriptor):
-    """CEDD of the whole image, compared by Tanimoto.
-
-    Attributes
-    ----------
-    blur : float
-        Standard deviation of a Gaussian blur, in blocks of the grid; 0 is the paper's CEDD. Noise looks like an edge
-        in blocks that are as small as its grain. A blur of about one block removes the noise and leaves the edges.
-    """
+    """CEDD of the whole image, compared by Tanimoto."""
 
     name: str = "cedd"
     version: int = 1
@@ -457,6 +450,8 @@ class Cedd(Descriptor):
     whole_image: bool = True
     is_plain_cedd: bool = True
     blur: float = 0.0
+    """Standard deviation of a Gaussian blur, in blocks of the grid; 0 is the paper's CEDD. Noise looks like an edge in
+    blocks that are as small as its grain. A blur of about one block removes the noise and leaves the edges."""
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
         image = view.alone if isinstance(view, Segmentation) else view

@@ -40,44 +40,30 @@ class DrawnFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class VisitChange:
-    """Largest changes of a visit.
-
-    Attributes
-    ----------
-    gain, colour, gradient : float
-        Relative brightness, relative brightness of each channel, and change of the light across the frame.
-    gamma : float
-        Logarithm of the sensor's exponent.
-    placement : float
-        Distance of the object from the axis, relative to the side of its photograph.
-    scale : float
-        Relative change of the size.
-    elevation_deg : float
-        Change of the camera's elevation.
-    shadow : float
-        Share of the light that is missing in the cast shadow.
-    specular : float
-        Grey levels of highlights on the object.
-    defocus_px : float
-        Standard deviation of the blur.
-    holder : float
-        Probability of a holder in front of the object.
-    noise : float
-        Standard deviation of the sensor's noise, in grey levels.
-    """
+    """Largest changes of a visit."""
 
     gain: float = 0.0
     colour: float = 0.0
     gradient: float = 0.0
+    """Relative brightness, relative brightness of each channel, and change of the light across the frame."""
     gamma: float = 0.0
+    """Logarithm of the sensor's exponent."""
     placement: float = 0.0
+    """Distance of the object from the axis, relative to the side of its photograph."""
     scale: float = 0.0
+    """Relative change of the size."""
     elevation_deg: float = 0.0
+    """Change of the camera's elevation."""
     shadow: float = 0.3
+    """Share of the light that is missing in the cast shadow."""
     specular: float = 0.0
+    """Grey levels of highlights on the object."""
     defocus_px: float = 0.0
+    """Standard deviation of the blur."""
     holder: float = 0.0
+    """Probability of a holder in front of the object."""
     noise: float = 1.5
+    """Standard deviation of the sensor's noise, in grey levels."""
 
 
 ENROLLMENT: Final = VisitChange()
@@ -94,18 +80,12 @@ HARD: Final = VisitChange(
 
 @dataclass(frozen=True, eq=False)
 class DrawnBench:
-    """A bench without an object.
-
-    Attributes
-    ----------
-    still : float32 array (240, 320, 3)
-        Everything that stands still, with the platter's rim.
-    top : float32 array (192, 192, 3)
-        The platter from above.
-    """
+    """A bench without an object."""
 
     still: Picture
+    """float32 array (240, 320, 3): everything that stands still, with the platter's rim."""
     top: Picture
+    """float32 array (192, 192, 3): the platter from above."""
 
     @classmethod
     def drawn(

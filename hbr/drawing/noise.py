@@ -17,21 +17,14 @@ MB_ANGLE_DEG: Final = 20.0
 
 @dataclass(frozen=True)
 class Noise:
-    """Motion blur of the optics, then Gaussian noise of the sensor.
-
-    Attributes
-    ----------
-    gaussian_variance : float
-        Variance of intensities in 0..1; 0: no noise.
-    motion_px : float
-        Length of the motion in pixels; 0: no blur.
-    motion_deg : float
-        Direction of the motion, counter-clockwise from the right.
-    """
+    """Motion blur of the optics, then Gaussian noise of the sensor."""
 
     gaussian_variance: float = 0.0
+    """Variance of intensities in 0..1; 0: no noise."""
     motion_px: float = 0.0
+    """Length of the motion in pixels; 0: no blur."""
     motion_deg: float = MB_ANGLE_DEG
+    """Direction of the motion, counter-clockwise from the right."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.gaussian_variance) and self.gaussian_variance >= 0):

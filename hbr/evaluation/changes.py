@@ -48,41 +48,28 @@ INTERVALS: Final = (
 
 @dataclass(frozen=True)
 class SearchResult:
-    """A search, with the leading object after each view.
-
-    Attributes
-    ----------
-    leaders : tuple of str
-        After 1, 2, 3 and 4 views.
-    outcome : Outcome
-        Outcome of the search within four views.
-    decided : str
-        The leading object at the end.
-    views : int
-        Views until the end.
-    verified : bool
-        Whether the last views were compared with enrolled ones, pixel by pixel (`hbr.dense.session`).
-    pose : StatedPose
-        Of the leading object at the end.
-    probability, not_enrolled : float
-        Stated probabilities of the decided object, and that the object is not enrolled.
-    left_out : Outcome, optional
-        Outcome of the same search if the object is not enrolled; None if it never was.
-    left_out_probability, left_out_not_enrolled : float, optional
-        The stated probabilities of that search.
-    """
+    """A search, with the leading object after each view."""
 
     leaders: tuple[str, ...]
+    """After 1, 2, 3 and 4 views."""
     outcome: Outcome
+    """Outcome of the search within four views."""
     decided: str
+    """The leading object at the end."""
     views: int
+    """Views until the end."""
     pose: StatedPose = field(default=StatedPose(0))
+    """Of the leading object at the end."""
     verified: bool = False
+    """Whether the last views were compared with enrolled ones, pixel by pixel (`hbr.dense.session`)."""
     probability: float = 0.0
     not_enrolled: float = 0.0
+    """Stated probabilities of the decided object, and that the object is not enrolled."""
     left_out: Outcome | None = None
+    """Outcome of the same search if the object is not enrolled; None if it never was."""
     left_out_probability: float | None = None
     left_out_not_enrolled: float | None = None
+    """The stated probabilities of that search."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,18 +152,12 @@ def search_changed(
 
 
 class SearchViews(NamedTuple):
-    """The views of a search.
-
-    Attributes
-    ----------
-    views
-        Yields the views so far, and the azimuth of the last one in degrees.
-    other_bench
-        Whether its empty-table image certainly shows another bench than that of the enrollment.
-    """
+    """The views of a search."""
 
     views: Iterator[tuple[ViewsTogether, float]]
+    """Yields the views so far, and the azimuth of the last one in degrees."""
     other_bench: bool
+    """Whether its empty-table image certainly shows another bench than that of the enrollment."""
 
 
 def searches(item: PhotographedObject, experiment: Experiment) -> Iterator[SearchViews]:

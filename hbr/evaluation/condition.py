@@ -25,42 +25,28 @@ _TEXTURE_OCTAVES: Final = (4, 8, 16, 32)  # coarse to fine; each octave is weake
 
 @dataclass(frozen=True)
 class Condition:
-    """The differences between an enrolled view and a query.
-
-    Attributes
-    ----------
-    size_px : int or None
-        Longer side of all images, also of enrolled views; None: the size of the file.
-    noise : Noise
-        Noise of the queries, applied at that size.
-    rotation_deg : float
-        Largest rotation of a query in the image plane, to either side; the angle is random.
-    background : {"same", "uniform", "textured"}
-        Background of a query instead of the dark surroundings.
-    prefilter_px : float
-        Standard deviation of a Gaussian blur of all images, also of enrolled views; 0: no blur.
-    perturbations : Perturbations
-        Perturbations of the queries.
-    descriptor : str
-        Descriptor of enrolled views and queries.
-    enrolled_noise : Noise
-        Noise of the enrolled views.
-    enrolled_background : {"same", "uniform", "textured"}
-        Background of the enrolled views instead of the dark surroundings; each view has its own.
-    cut_out : bool
-        Whether the object is cut out of every image as on the rig, and described before an even grey.
-    """
+    """The differences between an enrolled view and a query."""
 
     size_px: int | None = None
+    """Longer side of all images, also of enrolled views; None: the size of the file."""
     noise: Noise = field(default_factory=Noise)
+    """Noise of the queries, applied at that size."""
     rotation_deg: float = 0.0
+    """Largest rotation of a query in the image plane, to either side; the angle is random."""
     background: Background = "same"
+    """Background of a query instead of the dark surroundings."""
     prefilter_px: float = 0.0
+    """Standard deviation of a Gaussian blur of all images, also of enrolled views; 0: no blur."""
     perturbations: Perturbations = field(default_factory=Perturbations)
+    """Perturbations of the queries."""
     descriptor: str = "cedd"
+    """Descriptor of enrolled views and queries."""
     enrolled_noise: Noise = field(default_factory=Noise)
+    """Noise of the enrolled views."""
     enrolled_background: Background = "same"
+    """Background of the enrolled views instead of the dark surroundings; each view has its own."""
     cut_out: bool = False
+    """Whether the object is cut out of every image as on the rig, and described before an even grey."""
 
     def __post_init__(self) -> None:
         if self.size_px is not None and self.size_px < 2:

@@ -16,46 +16,33 @@ FORMAT: Final = 13
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment; equal ones give equal results on equal photographs.
-
-    Attributes
-    ----------
-    name : str
-        Name in files and reports.
-    condition : Condition
-        How the images of queries differ from those of enrolled views.
-    protocol : Protocol
-        The settings of the trials.
-    methods : tuple of Method
-        The methods that are compared, if the bench does not change.
-    objects, report : (int, int) or None
-        First and last object of the data set that takes part, and that is reported, counted from 1; None: all.
-    every : int
-        Step between the photographs of an object that are used: with 2, every second one.
-    change : {"none", "mild", "hard"} or None
-        None: trials that compare methods. Else searches of the rig, also for objects that are left out, after this
-        change of a whole drawn bench; none: the photographs as they are, with the noise of the condition, and queries
-        that are not enrolled.
-    picture : bool
-        Whether enrollment and searches use a picture of their empty table, if the bench changes.
-    plain : bool
-        Whether all drawn benches have a plain backdrop and a visible platter.
-    margin, min_views
-        Lead per view, and number of views, that end a search of the paper.
-    """
+    """An experiment; equal ones give equal results on equal photographs."""
 
     name: str
+    """Name in files and reports."""
     condition: Condition = field(default_factory=Condition)
+    """How the images of queries differ from those of enrolled views."""
     protocol: Protocol = field(default_factory=Protocol)
+    """The settings of the trials."""
     methods: tuple[Method, ...] = ()
+    """The methods that are compared, if the bench does not change."""
     objects: tuple[int, int] | None = None
     report: tuple[int, int] | None = None
+    """(int, int) or None: first and last object of the data set that takes part, and that is reported, counted from 1;
+    None: all."""
     every: int = 1
+    """Step between the photographs of an object that are used: with 2, every second one."""
     change: Change | None = None
+    """None: trials that compare methods. Else searches of the rig, also for objects that are left out, after this
+    change of a whole drawn bench; none: the photographs as they are, with the noise of the condition, and queries that
+    are not enrolled."""
     picture: bool = True
+    """Whether enrollment and searches use a picture of their empty table, if the bench changes."""
     plain: bool = False
+    """Whether all drawn benches have a plain backdrop and a visible platter."""
     margin: float = 0.02
     min_views: int = 2
+    """Lead per view, and number of views, that end a search of the paper."""
 
     def __post_init__(self) -> None:
         if self.change is not None and self.change not in get_args(Change):
@@ -96,21 +83,13 @@ class Experiment:
 
 
 class Kind(NamedTuple):
-    """The steps of a kind of experiment; objects are numbered from 0, each can be worked on in a process of its own.
-
-    Attributes
-    ----------
-    enroll
-        Describes the enrolled views of one object: experiment, data set, object.
-    model
-        Makes the model of all objects: experiment, data set, what `enroll` returned for each.
-    search
-        Searches for one object: experiment, data set, model, monotonic time in ns, object.
-    results
-        The results as JSON values: experiment, data set, model, what `search` returned for each object.
-    """
+    """The steps of a kind of experiment; objects are numbered from 0, each can be worked on in a process of its own."""
 
     enroll: Callable[[Experiment, Dataset, int], Any]
+    """Describes the enrolled views of one object: experiment, data set, object."""
     model: Callable[[Experiment, Dataset, list[Any]], Any]
+    """Makes the model of all objects: experiment, data set, what `enroll` returned for each."""
     search: Callable[[Experiment, Dataset, Any, Callable[[], int], int], Any]
+    """Searches for one object: experiment, data set, model, monotonic time in ns, object."""
     results: Callable[[Experiment, Dataset, Any, list[Any]], dict[str, Any]]
+    """The results as JSON values: experiment, data set, model, what `search` returned for each object."""

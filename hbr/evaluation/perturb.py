@@ -31,15 +31,10 @@ STRENGTHS: Final[Mapping[str, tuple[float, float, float]]] = {
 
 @dataclass(frozen=True)
 class Perturbations:
-    """Perturbations and their strengths.
-
-    Attributes
-    ----------
-    strengths : tuple of (str, int)
-        Names in `STRENGTHS`, each at most once, with a strength of 1, 2 or 3.
-    """
+    """Perturbations and their strengths."""
 
     strengths: tuple[tuple[str, int], ...] = ()
+    """tuple of (str, int): names in `STRENGTHS`, each at most once, with a strength of 1, 2 or 3."""
 
     def __post_init__(self) -> None:
         kinds = [kind for kind, _ in self.strengths]

@@ -60,21 +60,14 @@ class PhotographedObject:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Objects to enroll and to identify.
-
-    Attributes
-    ----------
-    name : str
-        Name in reports.
-    objects : tuple of PhotographedObject
-        At least two objects with different names.
-    ignored : int
-        Number of image files in the folder whose names are not those of views.
-    """
+    """Objects to enroll and to identify."""
 
     name: str
+    """Name in reports."""
     objects: tuple[PhotographedObject, ...]
+    """At least two objects with different names."""
     ignored: int = 0
+    """Number of image files in the folder whose names are not those of views."""
 
     def __post_init__(self) -> None:
         if len(self.objects) < 2:

@@ -13,25 +13,17 @@ _FAR_DEG = 30.0
 
 
 class StatedPose(NamedTuple):
-    """The pose that an answer states.
-
-    Attributes
-    ----------
-    number : int
-        Number of azimuths that are equally likely; 0 if none is stated.
-    error_deg : float or None
-        Distance of the nearest of them from the true one.
-    sigma_deg : float or None
-        Its standard uncertainty.
-    toward_deg : float or None
-        The error towards the nearest enrolled view; None if the object is seen from there, or from half-way between
-        two.
-    """
+    """The pose that an answer states."""
 
     number: int
+    """Number of azimuths that are equally likely; 0 if none is stated."""
     error_deg: float | None = None
+    """Distance of the nearest of them from the true one."""
     sigma_deg: float | None = None
+    """Its standard uncertainty."""
     toward_deg: float | None = None
+    """The error towards the nearest enrolled view; None if the object is seen from there, or from half-way between
+    two."""
 
 
 def stated_pose(found: Pose, true_deg: float, enrolled_deg: FloatArray) -> StatedPose:

@@ -39,43 +39,30 @@ Strategy = Literal[
 
 @dataclass(frozen=True)
 class Method:
-    """A retrieval method.
-
-    Attributes
-    ----------
-    name : str
-        Name in ``--methods``.
-    label : str
-        Name in tables and figures.
-    strategy : str
-        How the next view is chosen. ``random``; ``sweep-45``, ``sweep-90``: fixed steps; ``ahbr``: Eq. 5-7; ``coin``:
-        the step of Eq. 5-7 to a random side. ``ahbr`` and ``coin`` begin with two random views, ``ahbr-90`` with a
-        step of 90° to the left, like the rig. With the hidden Markov model only: ``least-risk``.
-        With the dense filter only: ``next-best-view``: `hbr.next_best_view`;
-        ``next-best-view-coin``: its rotation to a random side; ``mutual``: mutual information; ``oracle``: the
-        photograph with the largest lead of the true object.
-    omega, list_length, extension
-        Parameters of `hbr.retrieve` or `hbr.DenseIndex`.
-    views : int or None
-        Largest number of views of this method; None: that of the protocol.
-    dense : bool
-        Whether the dense filter ranks the objects, instead of the paper's voting.
-    sectors : int
-        Number of average views of an object (N~M of Eq. 5) that AHBR plans with.
-    hmm : bool
-        Whether the hidden Markov model over poses (`hbr.paper.hmm`) ranks the objects.
-    """
+    """A retrieval method."""
 
     name: str
+    """Name in ``--methods``."""
     label: str
+    """Name in tables and figures."""
     strategy: Strategy = "random"
+    """How the next view is chosen. ``random``; ``sweep-45``, ``sweep-90``: fixed steps; ``ahbr``: Eq. 5-7; ``coin``:
+    the step of Eq. 5-7 to a random side. ``ahbr`` and ``coin`` begin with two random views, ``ahbr-90`` with a step of
+    90° to the left, like the rig. With the hidden Markov model only: ``least-risk``. With the dense filter only:
+    ``next-best-view``: `hbr.next_best_view`; ``next-best-view-coin``: its rotation to a random side; ``mutual``: mutual
+    information; ``oracle``: the photograph with the largest lead of the true object."""
     omega: float = 0.5
     list_length: int = 10
     extension: Extension = "orient_all"
+    """Parameters of `hbr.retrieve` or `hbr.DenseIndex`."""
     views: int | None = None
+    """Largest number of views of this method; None: that of the protocol."""
     dense: bool = False
+    """Whether the dense filter ranks the objects, instead of the paper's voting."""
     sectors: int = 4
+    """Number of average views of an object (N~M of Eq. 5) that AHBR plans with."""
     hmm: bool = False
+    """Whether the hidden Markov model over poses (`hbr.paper.hmm`) ranks the objects."""
 
     @property
     def active(self) -> bool:
@@ -155,49 +142,34 @@ def choose_methods(names: Iterable[str]) -> tuple[Method, ...]:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The settings of the trials.
-
-    Attributes
-    ----------
-    trials : int
-        Number of trials for each object.
-    max_views : int
-        Number of queries in a trial; there are results after each query.
-    removal : {"near", "paper79", "queries"}
-        Enrolled views of the object that are removed before the search. ``near``: those closer than `near_deg` to any
-        query so far; ``paper79``: the queries and the next view of each (79 % of 72 views stay after 8 queries);
-        ``queries``: only the queries.
-    near_deg : float
-        The distance for ``near``.
-    sigma_deg : float
-        Standard deviation of the error of each measured orientation.
-    drift_deg : float
-        Drift of the measured orientation with each view.
-    rotation_errors_deg : tuple of float
-        Measured errors of rotations. If there are any, each rotation between two views has one of them at random, and
-        they add up, as those of a gyro do; `sigma_deg` and `drift_deg` then have no effect.
-    seed : int
-        Seed of all random values.
-    enrolled : int or None
-        Number of enrolled views of each object, at equal distances; queries are taken from the other views. None: all
-        views are enrolled, including the queries.
-    absent : tuple of str
-        Names of objects that are not enrolled, to measure unknown objects; only with the dense filter.
-    index : {"flat", "tree"}
-        Search for similar views (`hbr.ViewIndex`) in the first trial of each object, whose time is measured.
-    """
+    """The settings of the trials."""
 
     trials: int = 10
+    """Number of trials for each object."""
     max_views: int = 8
+    """Number of queries in a trial; there are results after each query."""
     removal: Removal = "near"
+    """{"near", "paper79", "queries"}: enrolled views of the object that are removed before the search. ``near``: those
+    closer than `near_deg` to any query so far; ``paper79``: the queries and the next view of each (79 % of 72 views
+    stay after 8 queries); ``queries``: only the queries."""
     near_deg: float = 10.0
+    """The distance for ``near``."""
     sigma_deg: float = 2.0
+    """Standard deviation of the error of each measured orientation."""
     drift_deg: float = 0.0
+    """Drift of the measured orientation with each view."""
     rotation_errors_deg: tuple[float, ...] = ()
+    """Measured errors of rotations. If there are any, each rotation between two views has one of them at random, and
+    they add up, as those of a gyro do; `sigma_deg` and `drift_deg` then have no effect."""
     seed: int = 0
+    """Seed of all random values."""
     enrolled: int | None = None
+    """Number of enrolled views of each object, at equal distances; queries are taken from the other views. None: all
+    views are enrolled, including the queries."""
     absent: tuple[str, ...] = ()
+    """Names of objects that are not enrolled, to measure unknown objects; only with the dense filter."""
     index: IndexMethod = "flat"
+    """Search for similar views (`hbr.ViewIndex`) in the first trial of each object, whose time is measured."""
 
     def __post_init__(self) -> None:
         if self.trials < 1 or self.max_views < 1:
@@ -221,47 +193,38 @@ class Protocol:
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """The results of the trials: arrays of shape (methods, objects, trials, views).
-
-    Attributes
-    ----------
-    rank : int32
-        Rank of the true object, 1 if it leads; 0 if it is not a candidate, -1 after the last view of the method.
-    pose_error_deg : float64
-        Distance of the estimated from the true orientation of the true object, 0..180; nan if it is not a candidate.
-    alike_error_deg : float64
-        Distance of the estimated from the nearest orientation in which the object looks as in the true one, 0..180.
-    period_deg : float64
-        Symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not symmetric;
-        nan if it has too few views.
-    stated : float64 (methods, objects, trials, views, 4)
-        `hbr.evaluation.poses.StatedPose` for the true object, where a search of the dense filter ends; else nan.
-    margin : float64
-        `hbr.score_margin` of the leading object per view; with the dense filter, its score minus the second score.
-    named : bool
-        Whether the true object leads. With the dense filter the decision counts, pixels included.
-    score : float64
-        The leading object's score per view.
-    outcome : int8
-        Decision of the stopping rule with the dense filter, as an index of `OUTCOMES`; -1 with the paper's voting.
-    travelled_deg : float64
-        Sum of the rotations since the first view, without signs.
-    step_ns : int64
-        Time of retrieval and decision in the first trial of each object, and with the dense filter in all; else 0. The
-        other trials of the paper's voting share the retrieval lists. 0 without a timer.
-    """
+    """The results of the trials: arrays of shape (methods, objects, trials, views)."""
 
     rank: NDArray[np.int32]
+    """int32: rank of the true object, 1 if it leads; 0 if it is not a candidate, -1 after the last view of the
+    method."""
     pose_error_deg: FloatArray
+    """float64: distance of the estimated from the true orientation of the true object, 0..180; nan if it is not a
+    candidate."""
     alike_error_deg: FloatArray
+    """float64: distance of the estimated from the nearest orientation in which the object looks as in the true one,
+    0..180."""
     period_deg: FloatArray
+    """float64: symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not
+    symmetric; nan if it has too few views."""
     stated: FloatArray
+    """float64 (methods, objects, trials, views, 4): `hbr.evaluation.poses.StatedPose` for the true object, where a
+    search of the dense filter ends; else nan."""
     margin: FloatArray
+    """float64: `hbr.score_margin` of the leading object per view; with the dense filter, its score minus the second
+    score."""
     named: NDArray[np.bool_]
+    """Whether the true object leads. With the dense filter the decision counts, pixels included."""
     score: FloatArray
+    """float64: the leading object's score per view."""
     outcome: NDArray[np.int8]
+    """int8: decision of the stopping rule with the dense filter, as an index of `OUTCOMES`; -1 with the paper's
+    voting."""
     travelled_deg: FloatArray
+    """float64: sum of the rotations since the first view, without signs."""
     step_ns: NDArray[np.int64]
+    """int64: time of retrieval and decision in the first trial of each object, and with the dense filter in all; else
+    0. The other trials of the paper's voting share the retrieval lists. 0 without a timer."""
 
     @classmethod
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":

@@ -22,51 +22,34 @@ _AT_ONCE: Final = 50  # objects whose views are compared at once: the memory doe
 
 @dataclass(frozen=True, slots=True)
 class Symmetry:
-    """Rotational symmetry of an object, as far as its descriptors show it.
-
-    Attributes
-    ----------
-    period_deg
-        The smallest rotation after which the object looks the same: 360 without symmetry, 0 if it looks the same from
-        everywhere. The pose of the object is ambiguous by multiples of it.
-    neighbours
-        Mean similarity of neighbouring views.
-    similarity
-        Mean similarity of views one period apart. For a period of 0, of the least similar views; for 360, the largest
-        one after the minimum.
-    """
+    """Rotational symmetry of an object, as far as its descriptors show it."""
 
     period_deg: float
+    """The smallest rotation after which the object looks the same: 360 without symmetry, 0 if it looks the same from
+    everywhere. The pose of the object is ambiguous by multiples of it."""
     neighbours: float
+    """Mean similarity of neighbouring views."""
     similarity: float
+    """Mean similarity of views one period apart. For a period of 0, of the least similar views; for 360, the largest
+    one after the minimum."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfusableObject:
-    """An object that another one can be confused with, seen from some sides.
-
-    Attributes
-    ----------
-    object_index
-        The other object.
-    arcs_deg
-        Ranges of azimuth, from and to, counter-clockwise, at which the object looks like the other one; in [0, 360).
-    differs_deg
-        The other ranges: the object looks like no view of the other one there.
-    other_differs_deg
-        Ranges of azimuth of the other object at which it looks like no view of this one.
-    share
-        Share of the object's views that look like the other one.
-    similarity
-        The largest similarity of a view of one to a view of the other.
-    """
+    """An object that another one can be confused with, seen from some sides."""
 
     object_index: int
+    """The other object."""
     arcs_deg: Arcs
+    """Ranges of azimuth, from and to, counter-clockwise, at which the object looks like the other one; in [0, 360)."""
     differs_deg: Arcs
+    """The other ranges: the object looks like no view of the other one there."""
     other_differs_deg: Arcs
+    """Ranges of azimuth of the other object at which it looks like no view of this one."""
     share: float
+    """Share of the object's views that look like the other one."""
     similarity: float
+    """The largest similarity of a view of one to a view of the other."""
 
 
 def symmetry(views: Views, object_index: int) -> Symmetry | None:

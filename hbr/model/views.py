@@ -23,19 +23,6 @@ class Views:
 
     Arrays of the correct type are not copied. They are read-only through this class.
 
-    Parameters
-    ----------
-    descriptors : uint8 array (n, length)
-        Levels of the descriptor; for CEDD, 144 levels 0..7.
-    azimuth_deg : float64 array (n,)
-        Orientation of the camera around the object, counter-clockwise seen from above; wrapped to [0, 360).
-    object_index : integer array (n,)
-        Index of each view's object in `object_names`.
-    object_names : sequence of str
-        Distinct names. An object may have no views.
-    descriptor : str
-        Name of the descriptor of all views.
-
     Raises
     ------
     TypeError, ValueError
@@ -44,10 +31,16 @@ class Views:
     """
 
     descriptors: LevelArray
+    """uint8 array (n, length): levels of the descriptor; for CEDD, 144 levels 0..7."""
     azimuth_deg: FloatArray
+    """float64 array (n,): orientation of the camera around the object, counter-clockwise seen from above; wrapped to
+    [0, 360)."""
     object_index: IndexArray
+    """integer array (n,): index of each view's object in `object_names`."""
     object_names: tuple[str, ...]
+    """Distinct names. An object may have no views."""
     descriptor: str = "cedd"
+    """Name of the descriptor of all views."""
 
     def __post_init__(self) -> None:
         names = tuple(self.object_names)

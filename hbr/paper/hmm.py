@@ -98,38 +98,26 @@ class PoseModel:
 
 @dataclass(frozen=True, eq=False)
 class RiskChoice:
-    """The rotation to the next view, and all rotations that were weighed.
-
-    Attributes
-    ----------
-    rotation_deg : float
-        Rotation of the camera around the object, positive to the left.
-    rotations_deg, risk : float64 arrays (a,)
-        The rotations that were weighed, and the expected risk of misclassification after each, 0 to 1.
-    """
+    """The rotation to the next view, and all rotations that were weighed."""
 
     rotation_deg: float
+    """Rotation of the camera around the object, positive to the left."""
     rotations_deg: FloatArray
     risk: FloatArray
+    """float64 arrays (a,): the rotations that were weighed, and the expected risk of misclassification after each, 0 to
+    1."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseBelief:
-    """The probabilities of all enrolled poses of all objects at the last view.
-
-    Attributes
-    ----------
-    model : PoseModel
-        The enrolled views. Each is a state of its object's model.
-    log_state : float64 array (n,)
-        Logarithm of the probability of each state: exp of all of them sums to 1.
-    orientation_deg : float64 array (N,)
-        Orientations of the queries, as passed.
-    """
+    """The probabilities of all enrolled poses of all objects at the last view."""
 
     model: PoseModel
+    """The enrolled views. Each is a state of its object's model."""
     log_state: FloatArray
+    """float64 array (n,): logarithm of the probability of each state: exp of all of them sums to 1."""
     orientation_deg: FloatArray
+    """float64 array (N,): orientations of the queries, as passed."""
 
     def ranking(self) -> tuple[IndexArray, FloatArray, FloatArray]:
         """Return the objects with a view, likeliest first, the logarithms of their probabilities, and their poses."""

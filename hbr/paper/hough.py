@@ -23,33 +23,23 @@ _Columns = list[IndexArray]
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """The candidates of a retrieval, best first.
-
-    Attributes
-    ----------
-    object_index : integer array (C,)
-        The objects with a view on any retrieval list, by falling score; equal scores by rising index.
-    scores : float64 array (C,)
-        Hough score H of each object; at most the number of queries.
-    pose_deg : float64 array (C,)
-        Orientation of the camera around each object at the last query, in [0, 360).
-    paths : integer array (C, N)
-        The view for each query on the best path of each object.
-    lists : tuple of N integer arrays
-        Retrieval list of each query: view indices, best first.
-    orientation_deg : float64 array (N,)
-        Orientations of the queries, as passed.
-    views : Views
-        The model set that the indices refer to.
-    """
+    """The candidates of a retrieval, best first."""
 
     object_index: IndexArray
+    """integer array (C,): the objects with a view on any retrieval list, by falling score; equal scores by rising
+    index."""
     scores: FloatArray
+    """float64 array (C,): Hough score H of each object; at most the number of queries."""
     pose_deg: FloatArray
+    """float64 array (C,): orientation of the camera around each object at the last query, in [0, 360)."""
     paths: IndexArray
+    """integer array (C, N): the view for each query on the best path of each object."""
     lists: tuple[IndexArray, ...]
+    """Retrieval list of each query: view indices, best first."""
     orientation_deg: FloatArray
+    """float64 array (N,): orientations of the queries, as passed."""
     views: Views
+    """The model set that the indices refer to."""
 
     def __len__(self) -> int:
         return len(self.object_index)

@@ -26,14 +26,6 @@ _REMEMBERED: Final = 64
 class ViewIndex:
     """Exact search for the most similar views, by the similarity of their descriptor.
 
-    Parameters
-    ----------
-    views : Views
-        The model set; it is not copied.
-    method : {"flat", "tree"}
-        ``flat`` compares with every view. ``tree``, the paper's index, compares with the views in some leaves of a
-        KD-tree, for views that Tanimoto compares. Both return the same result.
-
     Raises
     ------
     ValueError
@@ -44,7 +36,10 @@ class ViewIndex:
         if method not in get_args(Method):
             raise ValueError(f"method {method!r} is unknown; use one of {', '.join(get_args(Method))}")
         self.views = views
+        """The model set; it is not copied."""
         self.method = method
+        """``flat`` compares with every view. ``tree``, the paper's index, compares with the views in some leaves of a
+        KD-tree, for views that Tanimoto compares. Both return the same result."""
         self.descriptor = descriptor(views.descriptor)
         if method == "tree" and not self.descriptor.is_plain_cedd:
             raise ValueError(f"the tree compares plain CEDD, not {views.descriptor}; use flat")

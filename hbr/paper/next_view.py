@@ -25,32 +25,22 @@ _REVISIT_DEG: Final = 10.0
 
 @dataclass(frozen=True)
 class Decision:
-    """The side to rotate to, and the numbers of the decision.
-
-    Attributes
-    ----------
-    side : {"left", "right"}
-        ``left`` moves the camera counter-clockwise around the object, seen from above.
-    rotation_deg : float
-        Rotation of the camera around the object, positive to the left, including the detour.
-    s_left, s_right : float
-        Similarity of the candidates on each side (Eq. 6), summed over their pairs. The side with the smaller sum
-        separates them better.
-    candidates : tuple of int
-        Indices of the compared objects.
-    orientation_deg : float
-        Orientation after the rotation, with the same zero as those of the queries, in [0, 360).
-    detour_deg : float
-        Part of the rotation, without sign, that avoids orientations that were visited before.
-    """
+    """The side to rotate to, and the numbers of the decision."""
 
     side: Side
+    """``left`` moves the camera counter-clockwise around the object, seen from above."""
     rotation_deg: float
+    """Rotation of the camera around the object, positive to the left, including the detour."""
     s_left: float
     s_right: float
+    """Similarity of the candidates on each side (Eq. 6), summed over their pairs. The side with the smaller sum
+    separates them better."""
     candidates: tuple[int, ...]
+    """Indices of the compared objects."""
     orientation_deg: float
+    """Orientation after the rotation, with the same zero as those of the queries, in [0, 360)."""
     detour_deg: float
+    """Part of the rotation, without sign, that avoids orientations that were visited before."""
 
 
 def next_view(ranking: Ranking, *, side: Side | None = None, sectors: int = SECTORS) -> Decision:

@@ -136,16 +136,11 @@ class Issue:
 
 @dataclass(frozen=True, eq=False)
 class Illumination:
-    """Illumination correction of a frame: a plane for each channel.
-
-    Attributes
-    ----------
-    slopes : float64 array (3, 3)
-        Logarithms of the factors that the frame is multiplied by. Rows: value at the frame's middle, rise over its
-        width, rise over its height. Columns: B, G, R.
-    """
+    """Illumination correction of a frame: a plane for each channel."""
 
     slopes: FloatArray
+    """float64 array (3, 3): logarithms of the factors that the frame is multiplied by. Rows: value at the frame's
+    middle, rise over its width, rise over its height. Columns: B, G, R."""
 
     @property
     def gains(self) -> tuple[float, float, float]:
@@ -165,39 +160,26 @@ class Illumination:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Difference between a frame and the empty-table image.
-
-    Attributes
-    ----------
-    agreement : float
-        Share of the border's cells that look like the empty-table image after illumination correction.
-    certain : bool array (h, w)
-        Pixels of another colour, or brighter than the table can be.
-    possible : bool array (h, w)
-        Pixels that are darker by the same share in all colours: a shadow, or a grey object.
-    correction : Illumination
-        Brings the frame's illumination to that of the empty-table image.
-    evenly : float32 array (h, w)
-        Mean over the channels of what remains of the difference, in logarithms.
-    coloured : float32 array (h, w)
-        Largest distance of a channel from that mean.
-    residual : float32 array (h, w, 3)
-        What remains of the difference in each channel, in logarithms.
-    background : Background
-        The background.
-    still : bool
-        Whether the frame's edge looks like the background.
-    """
+    """Difference between a frame and the empty-table image."""
 
     agreement: float
+    """Share of the border's cells that look like the empty-table image after illumination correction."""
     certain: Mask
+    """bool array (h, w): pixels of another colour, or brighter than the table can be."""
     possible: Mask
+    """bool array (h, w): pixels that are darker by the same share in all colours: a shadow, or a grey object."""
     correction: Illumination
+    """Brings the frame's illumination to that of the empty-table image."""
     evenly: Floats
+    """float32 array (h, w): mean over the channels of what remains of the difference, in logarithms."""
     coloured: Floats
+    """float32 array (h, w): largest distance of a channel from that mean."""
     residual: Floats
+    """float32 array (h, w, 3): what remains of the difference in each channel, in logarithms."""
     background: "Background"
+    """The background."""
     still: bool
+    """Whether the frame's edge looks like the background."""
 
     @property
     def reliable(self) -> bool:
@@ -214,20 +196,14 @@ class ViewDifferences(NamedTuple):
     """How a frame differs from the views that its background was learned from, or from the empty-table image.
 
     Differences are the largest of a pixel's channels, on the scale `_FAR`.
-
-    Attributes
-    ----------
-    nearest : float32 array (h, w)
-        Difference from the view that is most similar in this pixel.
-    usual : float32 array (h, w)
-        Median of the differences.
-    equal : float32 array (h, w)
-        Share of the views that are equal in this pixel.
     """
 
     nearest: Floats
+    """float32 array (h, w): difference from the view that is most similar in this pixel."""
     usual: Floats
+    """float32 array (h, w): median of the differences."""
     equal: Floats
+    """float32 array (h, w): share of the views that are equal in this pixel."""
 
 
 class Background:

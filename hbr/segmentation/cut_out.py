@@ -24,42 +24,31 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """An object cut out of its frame, with the evidence.
-
-    Attributes
-    ----------
-    crop : uint8 array (160, 160, 3)
-        Square around the object, in BGR, after illumination correction.
-    mask : uint8 array (160, 160)
-        Share of each pixel that belongs to the object, 0..255; 255 everywhere if no object was found.
-    box : (int, int, int, int) or None
-        The object's x, y, width and height in pixels of the frame; None if no object was found.
-    gains : (float, float, float) or None
-        Factors of the illumination correction for B, G, R; None without correction.
-    agreement : float or None
-        Share of the frame's border that looks like the empty-table image; None without such an image.
-    method : Method
-        Method by which the box was found.
-    issues : tuple of Issue
-        Steps that were not possible, with their reasons.
-    correction : Illumination or None
-        The illumination correction.
-    silhouette : bool array (h, w) or None
-        The object's pixels in the small image (`hbr.segmentation.background.shrunk`); None if they are not known.
-    frame : SegmentedFrame or None
-        The frame; None if it was dropped to save memory.
-    """
+    """An object cut out of its frame, with the evidence."""
 
     crop: ImageArray
+    """uint8 array (160, 160, 3): square around the object, in BGR, after illumination correction."""
     mask: NDArray[np.uint8]
+    """uint8 array (160, 160): share of each pixel that belongs to the object, 0..255; 255 everywhere if no object was
+    found."""
     box: Box | None
+    """(int, int, int, int) or None: the object's x, y, width and height in pixels of the frame; None if no object was
+    found."""
     gains: tuple[float, float, float] | None
+    """(float, float, float) or None: factors of the illumination correction for B, G, R; None without correction."""
     agreement: float | None
+    """Share of the frame's border that looks like the empty-table image; None without such an image."""
     method: BoxMethod
+    """Method by which the box was found."""
     issues: tuple[Issue, ...] = ()
+    """Steps that were not possible, with their reasons."""
     correction: Illumination | None = field(default=None, repr=False)
+    """The illumination correction."""
     silhouette: NDArray[np.bool_] | None = field(default=None, repr=False)
+    """bool array (h, w) or None: the object's pixels in the small image (`hbr.segmentation.background.shrunk`); None if
+    they are not known."""
     frame: SegmentedFrame | None = field(default=None, repr=False)
+    """The frame; None if it was dropped to save memory."""
 
     def evidence(self) -> dict[str, Any]:
         """Return method, box, gains, agreement and issues as JSON values, to be stored with the view."""

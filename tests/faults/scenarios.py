@@ -32,45 +32,30 @@ ACK = Step.ACKNOWLEDGE
 
 @dataclass(frozen=True)
 class Scenario:
-    """A fault and its expected outcomes.
-
-    Attributes
-    ----------
-    fault
-        The fault during the enrollment, in the short notation.
-    code
-        Code of the error that stops the enrollment; None if it completes.
-    found
-        How the rig detects the fault, in words.
-    after
-        How the enrollment continues.
-    identify
-        The fault during the identification; default: the same fault during its first move.
-    answer
-        Code of the error that stops the identification, or `FOUND`, or None for an unknown object.
-    then
-        What the operator does first, in words.
-    step
-        The command without which the table does not move.
-    shown
-        Whether the stored images show the object, and with it the angle.
-    torque
-        Whether the servo's torque stays on because the servo cannot be reached.
-    late
-        Whether the enrollment detects the fault only at its end, or only in a large move.
-    """
+    """A fault and its expected outcomes."""
 
     fault: str
+    """The fault during the enrollment, in the short notation."""
     code: int | None
+    """Code of the error that stops the enrollment; None if it completes."""
     found: str
+    """How the rig detects the fault, in words."""
     after: After = After.DONE
+    """How the enrollment continues."""
     identify: str = ""
+    """The fault during the identification; default: the same fault during its first move."""
     answer: int | str | None = FOUND
+    """Code of the error that stops the identification, or `FOUND`, or None for an unknown object."""
     then: str = ""
+    """What the operator does first, in words."""
     step: Step | None = None
+    """The command without which the table does not move."""
     shown: bool = True
+    """Whether the stored images show the object, and with it the angle."""
     torque: bool = False
+    """Whether the servo's torque stays on because the servo cannot be reached."""
     late: bool = False
+    """Whether the enrollment detects the fault only at its end, or only in a large move."""
 
     @property
     def name(self) -> str:

@@ -52,16 +52,11 @@ class Done:
 
 
 class Commands:
-    """Commands in the folder ``inside``; they may change nothing outside of it, except the program's own folders.
-
-    Parameters
-    ----------
-    home
-        An empty folder.
-    """
+    """Commands in the folder ``inside``; they may change nothing outside of it, except the program's own folders."""
 
     def __init__(self, home: Path) -> None:
         self.home = home
+        """An empty folder."""
         self.inside = home / "inside"
         self.outside = home / "outside"
         self.inside.mkdir()

@@ -27,19 +27,13 @@ START_S: Final = 4.0
 
 
 class GuestBench:
-    """The bench in the machine: runs programs and moves cables.
-
-    Attributes
-    ----------
-    machine
-        The virtual machine.
-    played
-        The devices' other end.
-    """
+    """The bench in the machine: runs programs and moves cables."""
 
     def __init__(self, machine: Machine, played: PlayedBench) -> None:
         self.machine = machine
+        """The virtual machine."""
         self.played = played
+        """The devices' other end."""
         self._shown = {
             played.servo: ("/dev/serial/by-id/*", ""),
             played.imu: ("/sys/class/i2c-dev/*/name", "i2c-tiny-usb"),

@@ -48,13 +48,6 @@ class UsbDevice:
 
     A subclass gives ``identity``, ``speed`` and ``configuration``, answers its own requests in `request`, and gets the
     host's bytes in `receive`. It sends bytes by ``plug.deliver``.
-
-    Attributes
-    ----------
-    plug
-        The connection; None while it is not plugged in.
-    port
-        TCP port on this computer at which a host plugs the device in.
     """
 
     identity: Identity
@@ -63,8 +56,10 @@ class UsbDevice:
 
     def __init__(self) -> None:
         self.plug: Plug | None = None
+        """The connection; None while it is not plugged in."""
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
+        """TCP port on this computer at which a host plugs the device in."""
         self._thread = Thread(target=self._serve, name=type(self).__name__, daemon=True)
         self._thread.start()
 
