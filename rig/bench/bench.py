@@ -68,33 +68,7 @@ class Shelf(Protocol):
 
 @dataclass(slots=True)
 class Bench(AbstractContextManager["Bench"]):
-    """The devices of one bench, on one clock. IMU and camera are opened at their first use, or by `open_devices`.
-
-    Attributes
-    ----------
-    open_imu, open_camera
-        Open the device; `imu` and `camera` call them once.
-    placer
-        Puts objects on the table; None if a person does that, before a plan begins.
-    shelf
-        The hands of a simulated bench; None if the bench is a real one, or its objects are placed by a script.
-    conditions
-        The noise model or the calibrations in force; stored with every enrollment.
-    findings
-        Notes for the operator from the opening of the bench; stored with every enrollment.
-    calibration_findings
-        The findings about calibrations that are not in force, or only in part.
-    calibration_steps
-        The next step: the calibrations to be repeated.
-    state
-        Stores the table's revolutions and faults for the next program.
-    head
-        The rig head that `imu` is connected to; None if `imu` is on the computer's own I2C bus.
-    trace
-        Records what `servo`, `imu`, `head` and `camera` exchange with their devices; None without ``config.trace``.
-    connections
-        Connections that must be closed after the devices.
-    """
+    """The devices of one bench, on one clock. IMU and camera are opened at their first use, or by `open_devices`."""
 
     name: str
     config: RigConfig
@@ -102,16 +76,27 @@ class Bench(AbstractContextManager["Bench"]):
     servo: Servo
     open_imu: Callable[[], Imu] = field(repr=False)
     open_camera: Callable[[], Camera] = field(repr=False)
+    """Open the device; `imu` and `camera` call them once."""
     placer: Placer | None = None
+    """Puts objects on the table; None if a person does that, before a plan begins."""
     shelf: Shelf | None = None
+    """The hands of a simulated bench; None if the bench is a real one, or its objects are placed by a script."""
     conditions: Mapping[str, Any] = field(default_factory=dict)
+    """The noise model or the calibrations in force; stored with every enrollment."""
     findings: tuple[str, ...] = ()
+    """Notes for the operator from the opening of the bench; stored with every enrollment."""
     calibration_findings: tuple[str, ...] = field(default=(), init=False)
+    """The findings about calibrations that are not in force, or only in part."""
     calibration_steps: NextSteps = field(default=(), init=False)
+    """The next step: the calibrations to be repeated."""
     state: StateStore = field(default_factory=MemoryStore, repr=False)
+    """Stores the table's revolutions and faults for the next program."""
     head: RigHead | None = None
+    """The rig head that `imu` is connected to; None if `imu` is on the computer's own I2C bus."""
     trace: TraceWriter | None = field(default=None, repr=False)
+    """Records what `servo`, `imu`, `head` and `camera` exchange with their devices; None without ``config.trace``."""
     connections: ExitStack = field(default_factory=ExitStack, repr=False)
+    """Connections that must be closed after the devices."""
     safety: Safety = field(init=False, repr=False)
     _imu: Imu | None = field(default=None, init=False, repr=False)
     _camera: Camera | None = field(default=None, init=False, repr=False)

@@ -56,24 +56,16 @@ Steps = Generator[Step, None, T]
 
 
 class Desk(ABC):
-    """The place where a job runs: it opens bench and catalog, and asks the operator.
-
-    Attributes
-    ----------
-    operator
-        Answers the questions.
-    config
-        The configuration of the bench before it is opened.
-    place
-        Place of the bench's catalog.
-    log_waits_for_server
-        Whether an action on the bench may wait until a catalog on a server has its entry in the log.
-    """
+    """The place where a job runs: it opens bench and catalog, and asks the operator."""
 
     operator: Operator
+    """Answers the questions."""
     config: RigConfig
+    """The configuration of the bench before it is opened."""
     place: CatalogPlace
+    """Place of the bench's catalog."""
     log_waits_for_server = True
+    """Whether an action on the bench may wait until a catalog on a server has its entry in the log."""
 
     @abstractmethod
     def open_bench(self, devices: Iterable[str] = DEVICES) -> AbstractContextManager[Bench]:
