@@ -35,21 +35,21 @@ class Symmetry:
 
 
 @dataclass(frozen=True, slots=True)
-class ConfusableObject:
-    """An object that another one can be confused with, seen from some sides."""
+class SimilarObject:
+    """An enrolled object that looks like the new one from some sides."""
 
-    object_index: int
-    """The other object."""
+    name: str
+    """Name of the other enrolled object."""
     arcs_deg: Arcs
-    """Ranges of azimuth, from and to, counter-clockwise, at which the object looks like the other one; in [0, 360)."""
+    """Sides from which the new object looks like this one: pairs of azimuths (from, to), counter-clockwise."""
     differs_deg: Arcs
-    """The other ranges: the object looks like no view of the other one there."""
+    """The other sides of the new object: it looks like no view of this one there."""
     other_differs_deg: Arcs
-    """Ranges of azimuth of the other object at which it looks like no view of this one."""
+    """Sides of this object that look like no view of the new one."""
     share: float
-    """Share of the object's views that look like the other one."""
+    """Share of the new object's views that look like this object, from 0 to 1."""
     similarity: float
-    """The largest similarity of a view of one to a view of the other."""
+    """Largest similarity of a view of one object and a view of the other."""
 
 
 def symmetry(views: Views, object_index: int) -> Symmetry | None:
@@ -95,7 +95,7 @@ def symmetry(views: Views, object_index: int) -> Symmetry | None:
     return Symmetry(360.0, neighbours, float(mean[int(mean.argmin()) :].max()))
 
 
-def similar_objects(views: Views, object_index: int, most: int) -> tuple[ConfusableObject, ...]:
+def similar_objects(views: Views, object_index: int, most: int) -> tuple[SimilarObject, ...]:
     """Find the objects that an object can be confused with, and from which sides.
 
     A view looks like another object if one of that object's views is as similar to it as the more similar one of its
@@ -103,7 +103,7 @@ def similar_objects(views: Views, object_index: int, most: int) -> tuple[Confusa
 
     Returns
     -------
-    tuple of ConfusableObject
+    tuple of SimilarObject
         At most ``most``, the object with the largest share first. Empty if the object has fewer than three views.
     """
     descriptors, azimuth_deg = _ring(views, object_index)
@@ -122,8 +122,8 @@ def similar_objects(views: Views, object_index: int, most: int) -> tuple[Confusa
     for column in np.lexsort((others, -similarity, -share))[: min(most, int((share > 0).sum()))].tolist():
         theirs, their_azimuth_deg = _ring(views, int(others[column]))
         unlike = kind.similarity(theirs, descriptors).max(axis=1) < _enough(kind, theirs)
-        one = ConfusableObject(
-            object_index=int(others[column]),
+        one = SimilarObject(
+            name=views.object_names[others[column]],
             arcs_deg=_arcs(azimuth_deg, confused[:, column]),
             differs_deg=_arcs(azimuth_deg, ~confused[:, column]),
             other_differs_deg=_arcs(their_azimuth_deg, unlike),

@@ -18,6 +18,7 @@ from pydantic import ConfigDict, Discriminator, Field, GetPydanticSchema, TypeAd
 from pydantic_core import core_schema, from_json, to_json
 
 from hbr import Outcome, StopDecision, StopReason
+from hbr.model.symmetry import SimilarObject
 from rig.core.phrases import Worded
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
@@ -405,24 +406,6 @@ class Item:
     is not skipped."""
     error_code: int | None = None
     """Code of the error because of which the object is skipped; otherwise null."""
-
-
-@dataclass(frozen=True, slots=True)
-class SimilarObject:
-    """An enrolled object that looks like the new one from some sides."""
-
-    name: str
-    """Name of the other enrolled object."""
-    arcs_deg: tuple[tuple[float, float], ...]
-    """Sides from which the new object looks like this one: pairs of azimuths (from, to), counter-clockwise."""
-    differs_deg: tuple[tuple[float, float], ...]
-    """The other sides of the new object: it looks like no view of this one there."""
-    other_differs_deg: tuple[tuple[float, float], ...]
-    """Sides of this object that look like no view of the new one."""
-    share: float
-    """Share of the new object's views that look like this object, from 0 to 1."""
-    similarity: float
-    """Largest similarity of a view of one object and a view of the other."""
 
 
 @dataclass(frozen=True, slots=True)

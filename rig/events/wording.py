@@ -5,6 +5,7 @@ from math import ceil, nan
 from typing import Final
 
 from hbr import Outcome, StopDecision, StopReason
+from hbr.model.symmetry import SimilarObject
 from rig.core.next_steps import Do, NextStep, NextSteps, in_words, steps_from_json
 from rig.core.phrases import (
     angle_range,
@@ -40,7 +41,6 @@ from rig.events.events import (
     Rejected,
     RotationReason,
     ScanStarted,
-    SimilarObject,
     SimilarObjects,
     Started,
     Unwinding,

@@ -11,7 +11,7 @@ Decisions: docs/decisions/0002, docs/decisions/0019.
 from collections.abc import Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
 from typing import Final
@@ -31,7 +31,7 @@ from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
 from rig.devices.camera import Frame
-from rig.events.events import Enrolled, Event, Rejected, ScanStarted, SimilarObject, SimilarObjects, Started
+from rig.events.events import Enrolled, Event, Rejected, ScanStarted, SimilarObjects, Started
 from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, scan_speed, takes_in_motion
@@ -436,11 +436,5 @@ def similar_objects(views: Views, name: str) -> SimilarObjects:
         period_deg=own.period_deg if own else None,
         neighbour_similarity=own.neighbours if own else None,
         period_similarity=own.similarity if own else None,
-        objects=tuple(
-            SimilarObject(
-                name=views.object_names[one.object_index],
-                **{key: value for key, value in asdict(one).items() if key != "object_index"},
-            )
-            for one in symmetry.similar_objects(views, number, SHOWN_SIMILAR)
-        ),
+        objects=symmetry.similar_objects(views, number, SHOWN_SIMILAR),
     )

@@ -64,7 +64,7 @@ def test_arc_of_a_partly_equal_object_is_found_to_two_steps(start, length):
     same = (start + np.arange(length)) % COUNT
     other[same] = mine[same]
     (twin,) = similar_objects(views_of(mine, other), 0, 3)
-    assert twin.object_index == 1
+    assert twin.name == "o1"
     assert twin.similarity == 1.0
     assert length / COUNT <= twin.share <= (length + 4) / COUNT
     ((begin_deg, end_deg),) = twin.arcs_deg
@@ -76,7 +76,7 @@ def test_most_similar_objects_come_first_and_others_are_left_out():
     mine, half, other_object = ring(36), ring(36, seed=1), ring(36, seed=2)
     half[:18] = mine[:18]
     found = similar_objects(views_of(mine, other_object, half, mine), 0, 3)
-    assert [one.object_index for one in found] == [3, 2]
+    assert [one.name for one in found] == ["o3", "o2"]
     assert similar_objects(views_of(mine, other_object, half, mine), 0, 1) == found[:1]
     assert found[0].arcs_deg == ((0.0, 360.0),)
     assert found[0].differs_deg == found[0].other_differs_deg == ()

@@ -10,6 +10,7 @@ import hbr
 from docs.generate import CODES, events_page
 from hbr import StopDecision
 from hbr.dense import stopping
+from hbr.model.symmetry import SimilarObject
 from rig.catalog import Catalog, derived
 from rig.core.errors import ViewRejected
 from rig.devices.camera import CameraLocks
@@ -26,7 +27,6 @@ from rig.events.events import (
     Ranked,
     RotationReason,
     ScanStarted,
-    SimilarObject,
     Unwinding,
     Verified,
     Waiting,

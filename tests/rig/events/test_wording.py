@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from hbr import Outcome, StopDecision, StopReason
+from hbr.model.symmetry import SimilarObject
 from rig.core.next_steps import Do, steps_as_json
 from rig.events.events import (
     Candidate,
@@ -16,7 +17,6 @@ from rig.events.events import (
     NoteCode,
     Ranked,
     RotationReason,
-    SimilarObject,
     SimilarObjects,
     Verified,
     Weighed,

@@ -9,6 +9,7 @@ from itertools import islice
 import pytest
 
 from hbr import Outcome
+from hbr.model.symmetry import SimilarObject
 from rig.catalog import ObjectSummary
 from rig.cli.ui.live import LiveView
 from rig.cli.ui.prompts import TerminalOperator
@@ -16,7 +17,7 @@ from rig.cli.ui.settings import Settings
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
-from rig.events.events import Event, FrameUsed, Item, SimilarObject, SimilarObjects
+from rig.events.events import Event, FrameUsed, Item, SimilarObjects
 from rig.motion.move import MotionTimes
 from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Question
