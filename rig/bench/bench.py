@@ -246,18 +246,9 @@ def open_bench(
     seed: int | None = None,
     devices: Collection[str] = DEVICES,
 ) -> Bench:
-    """Open a bench by name; use it in a ``with`` block.
+    """Open a bench by its name (`bench_names`), by default ``config.default_bench``; use it in a ``with`` block.
 
-    Parameters
-    ----------
-    name
-        A kind of bench (`bench_names`); None takes ``config.default_bench``.
-    config
-        The configuration; None takes the defaults.
-    seed
-        Seed of a simulated bench; a real one ignores it.
-    devices
-        Devices to open now; the others are opened when they are first used. The servo is always opened.
+    The servo and ``devices`` are opened now, the others when they are first used. A real bench ignores the ``seed``.
 
     Raises `ConfigError`: the bench does not exist, or its options have mistakes. `DeviceNotFound`, `DeviceMismatch`,
     `DeviceSilent`: a device is missing, is another one, or does not answer. `BenchBusy`: another program uses the

@@ -63,20 +63,10 @@ class Catalog(AbstractContextManager["Catalog"]):
         read_only: bool = False,
         busy_timeout_s: float = 5.0,
     ) -> Self:
-        """Open the catalog in the folder, or at the place, ``path``.
+        """Open the catalog in the folder, or at the place, ``path``: a place may name a database server and a store.
 
-        Parameters
-        ----------
-        path
-            Folder of the catalog; or its place, which may name a database server and a store of images.
-        clock
-            Gives the civil time of what is stored.
-        create
-            Create the catalog if there is none and ``read_only`` is False.
-        read_only
-            Write nothing.
-        busy_timeout_s
-            How long to wait while another process writes.
+        With ``create`` a missing catalog is created, unless it is opened ``read_only``. ``busy_timeout_s`` is how long
+        to wait while another process writes.
 
         Raises `CatalogError`: there is no catalog, it is damaged or of another version of the program, or the system
         denies access. `CatalogUnavailable`: the server of the catalog does not answer.
@@ -205,23 +195,12 @@ class Catalog(AbstractContextManager["Catalog"]):
         replace: bool = False,
         empty_table: NDArray[np.uint8] | None = None,
     ) -> "OpenEnrollment":
-        """Start to enroll an object.
+        """Start to enroll an object of this name (`clean_name`).
 
-        Parameters
-        ----------
-        name
-            Name of the object; see `clean_name`.
-        planned_azimuth_deg
-            Azimuth planned for view 0, 1, ..., each in [0, 360).
-        provenance
-            The bench, devices and settings that take the views.
-        label, note
-            Texts of the object; None leaves those of a known object unchanged.
-        replace
-            Enroll a known object again. Its complete enrollment stays in use until the new one is complete. An
-            unfinished one is abandoned.
-        empty_table : uint8 array (H, W, 3), optional
-            The sheet of the bench's empty-table images (`rig.views.table_sheet`).
+        ``planned_azimuth_deg`` are those of view 0, 1, ..., each in [0, 360). A label or note that is None leaves that
+        of a known object unchanged. With ``replace`` a known object is enrolled again: its complete enrollment stays in
+        use until the new one is complete, and an unfinished one is abandoned. ``empty_table`` is the sheet of the
+        bench's empty-table images (`rig.views.table_sheet`), uint8 (H, W, 3).
 
         Raises `UsageError`: the name or the plan is not valid. `ObjectExists`: the object is enrolled already and
         ``replace`` is False. `CatalogError`: the object has an unfinished enrollment and ``replace`` is False, or

@@ -101,25 +101,11 @@ class Entry(Row):
 
     A line that changes an object has its state after the change: ``object_name``, ``label``, ``note``, ``deleted`` and
     ``created_utc``. A line that changes an enrollment has its new ``status``; if that is complete, also its ``seal``.
-
-    Attributes
-    ----------
-    id
-        Numbers the lines from 1, without a gap.
-    finished_utc
-        When the enrollment ended. It is earlier than the line if another catalog had it first.
-    seal
-        `seal_of` the enrollment: its sessions and its views.
-    result
-        The number of the answer that the line tells or corrects (`rig.catalog.results`).
-    details
-        For readers of the log.
-    record
-        The whole fact, if it is longer than the details.
     """
 
     __tablename__ = "log"
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    """Numbers the lines from 1, without a gap."""
     time_utc: Mapped[datetime] = mapped_column(UTC_TIME)
     user: Mapped[str] = mapped_column(TEXT)
     host: Mapped[str] = mapped_column(TEXT)
@@ -134,10 +120,15 @@ class Entry(Row):
     enrollment_id: Mapped[int | None] = mapped_column(COUNT, default=None)
     status: Mapped[EnrollmentStatus | None] = mapped_column(STATUS, default=None)
     finished_utc: Mapped[datetime | None] = mapped_column(UTC_TIME, default=None)
+    """When the enrollment ended. It is earlier than the line if another catalog had it first."""
     seal: Mapped[str | None] = mapped_column(limited(64), default=None)
+    """`seal_of` the enrollment: its sessions and its views."""
     result: Mapped[int | None] = mapped_column(COUNT, default=None, index=True)
+    """The number of the answer that the line tells or corrects (`rig.catalog.results`)."""
     details: Mapped[JsonObject] = mapped_column(JSON_OBJECT, default_factory=dict)
+    """For readers of the log."""
     record: Mapped[JsonObject | None] = mapped_column(JSON_OBJECT, default=None)
+    """The whole fact, if it is longer than the details."""
     digest: Mapped[str] = mapped_column(limited(64), init=False, default="")
 
 
@@ -192,46 +183,34 @@ class Session(Row):
 
 
 class View(Row):
-    """A view of an object, and the evidence on which it was accepted.
-
-    Attributes
-    ----------
-    index
-        Position in the plan of the enrollment, from 0.
-    azimuth_deg
-        Orientation of the camera around the object, in [0, 360).
-    commanded_deg, encoder_deg
-        Commanded and measured table angle, unwrapped; None for a view that was not taken by a bench.
-    imu_deg, imu_sigma_deg
-        Table angle measured by the IMU, unwrapped, and its standard uncertainty; both None without an IMU.
-    captured_ns, captured_utc
-        Start of the exposure on the bench's clock, and in civil time; None for a view that was not taken by a bench.
-    evidence
-        The numbers for which the view was accepted (sharpness, exposure, settling, locks) as JSON values. The keys
-        contain the units.
-    region
-        The part of the image that shows the object: x, y, width, height in pixels; None for the whole image.
-    image
-        Name of the image (`rig.catalog.images`): its SHA-256, and the suffix of its format.
-    """
+    """A view of an object, and the evidence on which it was accepted."""
 
     __tablename__ = "views"
     id: Mapped[int] = mapped_column(primary_key=True, init=False)
     enrollment_id: Mapped[int] = mapped_column(init=False, default=None)
     index: Mapped[int] = mapped_column("view_index", COUNT, CheckConstraint("view_index >= 0", name="view_index"))
+    """Position in the plan of the enrollment, from 0."""
     session: Mapped[int] = mapped_column(COUNT, init=False, default=0)
     azimuth_deg: Mapped[float] = mapped_column(
         NUMBER, CheckConstraint("azimuth_deg >= 0 AND azimuth_deg < 360", name="azimuth_deg")
     )
+    """Orientation of the camera around the object, in [0, 360)."""
     commanded_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
     encoder_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
+    """Commanded and measured table angle, unwrapped; None for a view that was not taken by a bench."""
     imu_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
     imu_sigma_deg: Mapped[float | None] = mapped_column(NUMBER, default=None)
+    """Table angle measured by the IMU, unwrapped, and its standard uncertainty; both None without an IMU."""
     captured_ns: Mapped[int | None] = mapped_column(NANOSECONDS, default=None)
     captured_utc: Mapped[datetime | None] = mapped_column(UTC_TIME, default=None)
+    """Start of the exposure on the bench's clock, and in civil time; None for a view that was not taken by a bench."""
     evidence: Mapped[JsonObject] = mapped_column(JSON_OBJECT, default_factory=dict)
+    """The numbers for which the view was accepted (sharpness, exposure, settling, locks) as JSON values. The keys
+    contain the units."""
     region: Mapped[Region | None] = mapped_column(REGION, default=None)
+    """The part of the image that shows the object: x, y, width, height in pixels; None for the whole image."""
     image: Mapped[str] = mapped_column(IMAGE_NAME, default="")
+    """Name of the image (`rig.catalog.images`): its SHA-256, and the suffix of its format."""
     image_bytes: Mapped[int] = mapped_column(COUNT, default=0)
     digest: Mapped[str] = mapped_column(limited(64), init=False, default="", repr=False)
     __table_args__ = (
@@ -259,26 +238,18 @@ class View(Row):
 
 
 class Derived(Row):
-    """Something that was computed from the facts of an enrollment (`rig.catalog.derived`). It can be deleted.
-
-    Attributes
-    ----------
-    seal
-        `Entry.seal` of the enrollment.
-    what
-        Its kind, such as the name of a descriptor.
-    made_by
-        The versions and settings of the computation.
-    sha256
-        Of the content.
-    """
+    """Something that was computed from the facts of an enrollment (`rig.catalog.derived`). It can be deleted."""
 
     __tablename__ = "derived"
     seal: Mapped[str] = mapped_column(limited(64), primary_key=True)
+    """`Entry.seal` of the enrollment."""
     what: Mapped[str] = mapped_column(limited(100), primary_key=True)
+    """Its kind, such as the name of a descriptor."""
     made_by: Mapped[str] = mapped_column(TEXT)
+    """The versions and settings of the computation."""
     content: Mapped[bytes] = mapped_column(BYTES)
     sha256: Mapped[str] = mapped_column(limited(64))
+    """Of the content."""
 
 
 FACTS: Final[tuple[type[Row], ...]] = (Entry, Enrollment, Session, View)

@@ -61,27 +61,18 @@ _READ_ERRORS: Final = (
 
 @dataclass(frozen=True)
 class Reading:
-    """How images are read.
-
-    Attributes
-    ----------
-    content
-        Returns the bytes under a name.
-    store
-        Gets the images; None stores none.
-    is_named
-        The names are those of a catalog, so the bytes can be compared with them.
-    decodes
-        Each image is also decoded, and the views are described.
-    descriptors
-        Those that describe them. A view that cannot be described would stop every later search, so it is rejected.
-    """
+    """How images are read."""
 
     content: Callable[[str], bytes]
+    """Returns the bytes under a name."""
     store: Images | None
+    """Gets the images; None stores none."""
     is_named: bool
+    """The names are those of a catalog, so the bytes can be compared with them."""
     decodes: bool
+    """Each image is also decoded, and the views are described."""
     descriptors: tuple[str, ...] = ()
+    """Those that describe them. A view that cannot be described would stop every later search, so it is rejected."""
 
 
 @dataclass

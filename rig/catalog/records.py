@@ -63,24 +63,16 @@ def this_software() -> str:
 class Provenance:
     """The bench, devices and settings that took a view.
 
-    Parameters
-    ----------
-    bench
-        Name of the bench.
-    devices
-        Identities of servo, IMU and camera (models, serials, firmware), as JSON values.
-    conditions
-        Noise model, calibrations in force and settings, as JSON values.
-    software
-        Name and version of the program.
-
     Raises `UsageError`: the devices or conditions are not JSON values.
     """
 
     bench: str
     devices: JsonObject
+    """Identities of servo, IMU and camera (models, serials, firmware), as JSON values."""
     conditions: JsonObject = field(default_factory=dict)
+    """Noise model, calibrations in force and settings, as JSON values."""
     software: str = field(default_factory=this_software)
+    """Name and version of the program."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "devices", as_json(self.devices, "The identities of the devices"))

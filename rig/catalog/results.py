@@ -41,27 +41,19 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class NewResult:
-    """An answer to be recorded, with the event `identified` as its ``details``, JSON values.
-
-    Attributes
-    ----------
-    azimuths_deg
-        Azimuths of the views, from any zero.
-    catalog_version
-        `Catalog.version` when the enrolled views were loaded.
-    operator
-        None for the user's account.
-    key
-        The same in every catalog that has the answer.
-    """
+    """An answer to be recorded, with the event `identified` as its ``details``, JSON values."""
 
     answered: Answer
     details: JsonObject
     azimuths_deg: tuple[float, ...]
+    """Azimuths of the views, from any zero."""
     provenance: Provenance
     catalog_version: str
+    """`Catalog.version` when the enrolled views were loaded."""
     operator: str | None = None
+    """None for the user's account."""
     key: str = field(default_factory=lambda: secrets.token_hex(32))
+    """The same in every catalog that has the answer."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -176,23 +176,13 @@ def transfer(
     a second time. Of photographs, those that cannot be used are left out; of a catalog, nothing is transferred if one
     image is wrong.
 
-    Parameters
-    ----------
-    label
-        Label of new objects that have none.
-    descriptors
-        Descriptors to be computed at once, unless the source is this bench's own; others when they are needed.
-    jobs
-        Number of processes; None for one process per core.
-    dry_run
-        Only check everything.
-    once
-        An enrollment is delivered: it stays as the target has it, even if it was deleted or replaced there. What was
-        computed from it goes with it.
+    New objects that have no label get this ``label``. The ``descriptors`` are computed at once, unless the source is
+    this bench's own; others when they are needed. ``jobs`` is the number of processes; None is one for each core.
+    ``dry_run`` only checks everything. With ``once`` an enrollment is delivered: it stays as the target has it, even if
+    it was deleted or replaced there, and what was computed from it goes with it.
 
-    Raises `UsageError`: the label cannot be stored. `ImportRejected`: nothing is left
-    to transfer, or an image of a catalog was rejected. `ObjectExists`: some objects are in the catalog already, and
-    conflicts are rejected.
+    Raises `UsageError`: the label cannot be stored. `ImportRejected`: nothing is left to transfer, or an image of a
+    catalog was rejected. `ObjectExists`: some objects are in the catalog already, and conflicts are rejected.
     """
     checked_texts(label, None)
     catalog = source if isinstance(source, CatalogSource) else None

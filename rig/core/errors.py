@@ -17,20 +17,9 @@ Evidence = Mapping[str, Any]
 class RigError(Exception):
     """Base of every error that the rig raises on purpose. Its texts and its evidence are `masked`.
 
-    Parameters
-    ----------
-    what
-        What happened, in a sentence.
-    next_step
-        What the operator does now: sentences in the imperative for what only hands can do, and actions of the rig
-        (`rig.core.next_steps`), in order.
-    evidence
-        The numbers that led to the error, with units in the keys.
-
-    Attributes
-    ----------
-    steps
-        The next step as sentences and actions.
+    ``what`` happened is a sentence. ``next_step`` is what the operator does now: sentences in the imperative for what
+    only hands can do, and actions of the rig (`rig.core.next_steps`), in order; ``steps`` are the same. ``evidence``
+    has the numbers that led to the error, with units in the keys.
     """
 
     code: ClassVar[int] = 100

@@ -18,19 +18,13 @@ from rig.core.masking import masked
 
 @unique
 class Do(StrEnum):
-    """The actions that a next step can name. Call one to give it parameters: ``Do.ENROLL(name="lamp")``.
-
-    Attributes
-    ----------
-    words
-        The action in words, without capital and full stop.
-    command
-        The command that does it; empty if no command does. It contains ``{key}`` for parameters in fixed places. All
-        other parameters are options: ``reboot=True`` is ``--reboot``.
-    """
+    """The actions that a next step can name. Call one to give it parameters: ``Do.ENROLL(name="lamp")``."""
 
     words: str
+    """The action in words, without capital and full stop."""
     command: str
+    """The command that does it; empty if no command does. It contains ``{key}`` for parameters in fixed places. All
+    other parameters are options: ``reboot=True`` is ``--reboot``."""
 
     def __new__(cls, value: str, words: str, command: str = "") -> Self:
         member = str.__new__(cls, value)
@@ -114,21 +108,13 @@ _ACTIONS: Final = {str(action): action for action in Do}
 
 @dataclass(frozen=True, slots=True)
 class NextStep:
-    """An action that the operator does next.
-
-    Attributes
-    ----------
-    action
-        What to do.
-    parameters
-        Its parameters. Passwords in them are `masked`.
-    options
-        Options of the command line that select the bench and its configuration: ``--bench sim``.
-    """
+    """An action that the operator does next."""
 
     action: Do
     parameters: dict[str, Any] = field(default_factory=dict)
+    """Its parameters. Passwords in them are `masked`."""
     options: tuple[str, ...] = field(default=(), compare=False)
+    """Options of the command line that select the bench and its configuration: ``--bench sim``."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", masked(self.parameters))

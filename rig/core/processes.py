@@ -24,14 +24,8 @@ _AHEAD: Final = 4
 def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: int) -> Iterator[tuple[_Item, _T]]:
     """Yield each item with its result, in the order of completion; closing the generator ends the processes.
 
-    Parameters
-    ----------
-    work
-        A function that can be pickled, or a partial of one; it is sent to each process once.
-    items
-        Items that can be hashed and pickled. They are read as they are needed.
-    jobs
-        Largest number of processes; with 1 the work is done in this process.
+    There are at most ``jobs`` processes; with 1 the work is done in this process. ``work`` can be pickled, and is sent
+    to each process once. The items, which can be hashed and pickled, are read as they are needed.
     """
     waiting = iter(items)
     first = tuple(islice(waiting, jobs))

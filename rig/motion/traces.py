@@ -28,36 +28,24 @@ AFTER_S: Final = 2.0
 
 @dataclass(eq=False)
 class MoveTrace:
-    """The readings of one move, from its beginning until `AFTER_S` after its rest.
-
-    Attributes
-    ----------
-    utc
-        Time of its beginning.
-    start_ns, from_deg
-        Time and angle of its beginning.
-    bias_dps
-        The gyro's rate at the rest before.
-    goals
-        Each goal with its time and its profile.
-    readings
-        Time, angles of encoder and servo profile (None if the model does not report it), and load, the share of the
-        torque or of the current limit.
-    arrived_ns
-        Time of the first reading after the end of the servo's profile.
-    settled_ns
-        Time of the rest; None if the move failed.
-    """
+    """The readings of one move, from its beginning until `AFTER_S` after its rest."""
 
     utc: str
     start_ns: int
     from_deg: float
+    """Time and angle of its beginning."""
     bias_dps: float
+    """The gyro's rate at the rest before."""
     goals: list[tuple[int, float, MotionProfile]] = field(default_factory=list)
+    """Each goal with its time and its profile."""
     readings: deque[tuple[int, float, float | None, float]] = field(default_factory=lambda: deque(maxlen=MOST))
+    """Time, angles of encoder and servo profile (None if the model does not report it), and load, the share of the
+    torque or of the current limit."""
     samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=lambda: deque(maxlen=MOST))
     arrived_ns: int | None = None
+    """Time of the first reading after the end of the servo's profile."""
     settled_ns: int | None = None
+    """Time of the rest; None if the move failed."""
 
     def add_reading(self, state: ServoState, encoder_deg: float, profile_deg: float | None) -> None:
         """Add a reading of the servo, with its angles as the table's."""

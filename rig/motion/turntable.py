@@ -42,28 +42,19 @@ GYRO_LAG_S = 0.012
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """The observation and the control of a motion while the table rotates.
-
-    Attributes
-    ----------
-    each
-        Called in each round of the control loop, instead of a pause: it waits for the next frame, for example. It
-        returns a new goal, or None to continue to the last one.
-    reach_deg
-        Lowest and highest goal that ``each`` may return.
-    recorder
-        Receives the readings of the encoder and the samples of the gyro.
-    velocity_dps
-        Cruise speed.
-    quiet
-        Whether the motion ends with a rest, as before a view; otherwise it is enough to arrive.
-    """
+    """The observation and the control of a motion while the table rotates."""
 
     each: Callable[[], float | None]
+    """Called in each round of the control loop, instead of a pause: it waits for the next frame, for example. It
+    returns a new goal, or None to continue to the last one."""
     reach_deg: tuple[float, float]
+    """Lowest and highest goal that ``each`` may return."""
     recorder: TrajectoryRecorder
+    """Receives the readings of the encoder and the samples of the gyro."""
     velocity_dps: float
+    """Cruise speed."""
     quiet: bool = True
+    """Whether the motion ends with a rest, as before a view; otherwise it is enough to arrive."""
 
 
 @dataclass(slots=True)
@@ -101,19 +92,9 @@ class Turntable(AbstractContextManager["Turntable"]):
     Entering moves nothing: `rig.safety.supervisor` decides whether the table may move, then the servo holds its present
     position. Leaving always switches the torque off.
 
-    Parameters
-    ----------
-    trust_gyro
-        Whether a motion is stopped if the gyro contradicts the encoder. Calibrations of the gyro set it to False.
-    first_rest_s
-        How long the gyro is averaged for its first bias.
-    changes
-        Settings of the section ``table`` that differ from those of the bench. Calibrations change them.
-
-    Attributes
-    ----------
-    moves
-        Traces of the last moves.
+    With ``trust_gyro`` a motion is stopped if the gyro contradicts the encoder; calibrations of the gyro do without it.
+    The gyro is averaged over ``first_rest_s`` for its first bias. ``changes`` are settings of the section ``table``, for
+    calibrations, that differ from those of the bench. ``moves`` are the traces of the last moves.
     """
 
     def __init__(

@@ -65,13 +65,7 @@ class _SeenView:
 
 @dataclass(eq=False)
 class EnrollmentViews:
-    """Takes and stores the views of one session of an enrollment.
-
-    Attributes
-    ----------
-    retakes
-        The number of images that were taken again.
-    """
+    """Takes and stores the views of one session of an enrollment."""
 
     bench: Bench
     enrollment: OpenEnrollment
@@ -79,6 +73,7 @@ class EnrollmentViews:
     table: Turntable
     viewer: Viewer
     retakes: int = 0
+    """The number of images that were taken again."""
     _first: _SeenView | None = None
 
     def __post_init__(self) -> None:

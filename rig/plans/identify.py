@@ -75,21 +75,7 @@ NEW_GOAL_DEG: Final = 10.0  # smaller: the table changes its speed for goals tha
 
 @dataclass(eq=False)
 class ViewsAtRest:
-    """The views of a search, each at rest.
-
-    Attributes
-    ----------
-    check
-        Gets image and azimuth of each view, and raises an error if the table is empty.
-    live
-        Called with the event of each frame of a search in motion.
-    number
-        Counts the views from 0.
-    is_over, ended_ns
-        Whether the search has ended, and when its last view was decided.
-    unseen
-        The events of the present rotation that were not yielded yet.
-    """
+    """The views of a search, each at rest."""
 
     bench: Bench
     model: Model
@@ -97,16 +83,21 @@ class ViewsAtRest:
     viewer: Viewer
     describe: SearchDescriber
     check: ObjectCheck
+    """Gets image and azimuth of each view, and raises an error if the table is empty."""
     live: Callable[[FrameUsed], object]
+    """Called with the event of each frame of a search in motion."""
     first_rest_s: float = FIRST_REST_S
     number: int = 0
+    """Counts the views from 0."""
     travelled_deg: float = 0.0
     is_over: bool = False
     started_ns: int = field(init=False)
     ended_ns: int = field(init=False)
+    """When the last view was decided."""
     settled_ns: int = field(init=False)
     locks: CameraLocks = field(init=False)
     unseen: list[Event] = field(default_factory=list)
+    """The events of the present rotation that were not yielded yet."""
     _orientation_deg: float = field(init=False)
     _missing: CatalogError | None = field(default=None, init=False)
 
@@ -318,25 +309,11 @@ def identify(
     successor of the paper, ends when an object has a probability of 98 %, or after ``identify.max_views``, and calls
     objects unknown like ``ahbr``. Closing the generator turns the torque off.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    model
-        The enrolled views, from `rig.search.model.load_model` or `rig.search.model.model_of`.
-    config
-        The settings of the search, if they are not those of the bench.
-    placer
-        Puts the object on the table, or waits for it; the default is that of the bench.
-    strategy
-        Its name, or a `Strategy` object. The default is the one that the model is for.
-    seed
-        For strategies that draw random numbers.
-    top
-        The number of candidates that the events name.
-    live
-        Called with the event of each frame of a search in motion while the table rotates; the plan yields these events
-        when it has stopped. It must return at once.
+    The model is from `rig.search.model.load_model` or `rig.search.model.model_of`. The default strategy is the one that
+    the model is for; ``seed`` is for those that draw random numbers. ``config`` are settings of the search that are not
+    those of the bench. ``placer`` puts the object on the table, or waits for it; the default is that of the bench.
+    Events name the ``top`` candidates. ``live`` is called with the event of each frame of a search in motion while the
+    table rotates; the plan yields these events when it has stopped. It must return at once.
 
     Raises `CatalogError`: nothing is enrolled. `CameraSettingsDiffer`: all objects were enrolled with other settings of
     the camera. `UsageError`: there is no such strategy, or the model is not for it. `NoObject`: the table is
@@ -461,29 +438,17 @@ class ResultRecorder:
 
     An answer is never lost: show it before it is recorded. A catalog that cannot be written is a `Warned`.
 
-    Parameters
-    ----------
-    place
-        Place of the catalog.
-    bench
-        The bench that takes the views.
-    clock
-        Clock for the civil time of the results.
-    catalog_version
-        Returns `Catalog.version` of the views that the search has loaded.
-    operator
-        None for the user's account.
-    with_image
-        Whether to store images.
-
     ``sample`` is the sample on the table, None if it has no name. It is for one object: give it before each answer.
     """
 
     place: CatalogPlace | Path
     bench: Bench
     clock: Clock
+    """Gives the civil time of the results."""
     catalog_version: Callable[[], str]
+    """Returns `Catalog.version` of the views that the search has loaded."""
     operator: str | None = None
+    """None for the user's account."""
     with_image: bool = True
     sample: str | None = field(default=None, init=False)
     _image: NDArray[np.uint8] | None = field(default=None, init=False)

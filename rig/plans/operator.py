@@ -42,28 +42,19 @@ class Subject(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question to the operator.
-
-    Attributes
-    ----------
-    subject, text
-        What it is about, and what to do, as sentences.
-    choices
-        The possible answers, with what each one does.
-    default
-        The answer of the key Enter.
-    unattended
-        The answer if there is no operator.
-    steps
-        What is to be done before the answer, as the next step of an error.
-    """
+    """A question to the operator."""
 
     subject: Subject
     text: str
+    """What to do, as sentences."""
     choices: Mapping[Choice, str] = field(default_factory=lambda: {Choice.CONTINUE: "continue", Choice.STOP: "stop"})
+    """The possible answers, with what each one does."""
     default: Choice = Choice.CONTINUE
+    """The answer of the key Enter."""
     unattended: Choice = Choice.CONTINUE
+    """The answer if there is no operator."""
     steps: SomeSteps = ()
+    """What is to be done before the answer, as the next step of an error."""
 
 
 class Operator(Protocol):

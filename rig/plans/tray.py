@@ -122,21 +122,10 @@ def enroll_tray(
     """Enroll the objects of a tray one after the other; yields an `Item` before the events of each.
 
     Complete objects are skipped, and interrupted enrollments are resumed. So after an interruption, the same call
-    enrolls the remaining objects.
-
-    Parameters
-    ----------
-    bench, catalog
-        Both open.
-    items
-        From `read_tray`.
-    views
-        Number of views for objects without their own; by default ``enroll.views``.
-    operator
-        Puts the objects on the table, and decides whether each is enrolled; by default `Unattended`.
-    fly
-        Whether the views are taken in motion. The default is ``enroll.mode``; "auto" means in motion if the camera's
-        time is calibrated and the cable budget allows a revolution.
+    enrolls the remaining objects. ``views`` is for objects without their own number of views; by default
+    ``enroll.views``. The ``operator`` puts the objects on the table, and decides whether each is enrolled; by default
+    `Unattended`. ``fly`` takes the views in motion. The default is ``enroll.mode``; "auto" means in motion if the
+    camera's time is calibrated and the cable budget allows a revolution.
 
     Raises `RigError`: as in `enroll`, if the operator decides to stop.
     """

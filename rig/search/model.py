@@ -34,31 +34,21 @@ from rig.views.empty_table import empty_table_status
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Enrolled views, prepared for searches: the paper's, or the dense ones.
-
-    Attributes
-    ----------
-    index : hbr.ViewIndex or hbr.DenseIndex
-        Index for the paper's searches, or for the dense search.
-    notes
-        For the operator about an answer by this model.
-    with_empty_table
-        Whether most objects were enrolled with an empty-table image; None if that is not known.
-    camera
-        The camera's settings of the enrollments, each combination once.
-    empty_table : uint8 array (H, W, 3), optional
-        The newest sheet of empty-table images of the enrollments (`rig.views.table_sheet`).
-    leader_views
-        Returns the enrolled views of an object near some azimuths (`rig.catalog.derived.local_views`); None if the
-        model does not come from a catalog.
-    """
+    """Enrolled views, prepared for searches: the paper's, or the dense ones."""
 
     index: hbr.ViewIndex | hbr.DenseIndex
+    """Index for the paper's searches, or for the dense search."""
     notes: tuple[Note, ...] = ()
+    """For the operator about an answer by this model."""
     with_empty_table: bool | None = None
+    """Whether most objects were enrolled with an empty-table image; None if that is not known."""
     camera: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
+    """The camera's settings of the enrollments, each combination once."""
     empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
+    """The newest sheet of empty-table images of the enrollments, uint8 (H, W, 3) (`rig.views.table_sheet`)."""
     leader_views: EnrolledViews | None = field(default=None, repr=False)
+    """Returns the enrolled views of an object near some azimuths (`rig.catalog.derived.local_views`); None if the model
+    does not come from a catalog."""
 
     @property
     def views(self) -> hbr.Views:

@@ -128,31 +128,19 @@ def saving(
 
 @dataclass(frozen=True, slots=True)
 class SavedRun:
-    """The content of a saved run.
-
-    Attributes
-    ----------
-    about
-        Bench, devices, conditions and software, as JSON values.
-    config
-        The settings of the search.
-    model : Model
-        The enrolled views of the search.
-    empty_table : uint8 array (H, W, 3), or None
-        The sheet of empty-table images (`rig.views.table_sheet`).
-    error
-        The error that ended the search, as in `RigError.as_dict`.
-    is_cut
-        Whether the last line of the events was cut off while it was written.
-    """
+    """The content of a saved run."""
 
     folder: Path
     about: dict[str, Any]
+    """Bench, devices, conditions and software, as JSON values."""
     config: RigConfig
     model: Model
     empty_table: NDArray[np.uint8] | None
+    """The sheet of empty-table images, uint8 (H, W, 3) (`rig.views.table_sheet`)."""
     error: dict[str, Any] | None
+    """The error that ended the search, as in `RigError.as_dict`."""
     is_cut: bool
+    """Whether the last line of the events was cut off while it was written."""
     _lines: tuple[dict[str, Any], ...]
 
     @property

@@ -50,31 +50,21 @@ class _AnyState:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SearchState(_AnyState):
-    """The state of the paper's search after a view; also ``table_deg``, ``config`` and ``rng``.
-
-    Attributes
-    ----------
-    index : hbr.ViewIndex
-        The enrolled views.
-    queries : uint8 array (N, 144)
-        Descriptors of the views so far, in their order.
-    ranking : hbr.Ranking
-        The objects by their scores; `ranking.orientation_deg` has the orientation of each view.
-    score, margin
-        Hough score and margin of the leading candidate, per view (`hbr.score_margin`).
-    min_score
-        Below this score per view the object is unknown.
-    limits_deg
-        The limits of the cable.
-    """
+    """The state of the paper's search after a view; also ``table_deg``, ``config`` and ``rng``."""
 
     index: hbr.ViewIndex
+    """The enrolled views."""
     queries: NDArray[np.uint8]
+    """Descriptors of the views so far, in their order, uint8 (N, 144)."""
     ranking: hbr.Ranking
+    """The objects by their scores; `ranking.orientation_deg` has the orientation of each view."""
     score: float
     margin: float
+    """Hough score and margin of the leading candidate, per view (`hbr.score_margin`)."""
     min_score: float
+    """Below this score per view the object is unknown."""
     limits_deg: tuple[float, float]
+    """The limits of the cable."""
 
     @property
     def views(self) -> int:
@@ -84,25 +74,17 @@ class SearchState(_AnyState):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PoseSearchState(_AnyState):
-    """The state of a search by the hidden Markov model after a view; also ``table_deg``, ``config`` and ``rng``.
-
-    Attributes
-    ----------
-    belief : hbr.paper.hmm.PoseBelief
-        The probabilities of all poses, with its method ``next_view``.
-    probability, score : float
-        Those of the leading candidate; the score per view is the similarity to its most similar views.
-    min_score : float
-        Below this score per view the object is unknown.
-    rotations_deg : float64 array (a,)
-        Rotations of the camera around the object that the cable allows, every 5°.
-    """
+    """The state of a search by the hidden Markov model after a view; also ``table_deg``, ``config`` and ``rng``."""
 
     belief: PoseBelief
+    """The probabilities of all poses, with its method ``next_view``."""
     probability: float
     score: float
+    """Both of the leading candidate; the score per view is the similarity to its most similar views."""
     min_score: float
+    """Below this score per view the object is unknown."""
     rotations_deg: NDArray[np.float64]
+    """Rotations of the camera around the object that the cable allows, every 5°, float64 (a,)."""
 
     @property
     def views(self) -> int:
@@ -112,22 +94,16 @@ class PoseSearchState(_AnyState):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DenseSearchState(_AnyState):
-    """The state of the dense search after a view; also ``table_deg``, ``config`` and ``rng``.
-
-    Attributes
-    ----------
-    session : hbr.DenseSession
-        The search, with its ``belief`` and its method ``next_best_view``.
-    decision : hbr.StopDecision
-        What follows from the views so far.
-    rotations_deg, seconds : float64 arrays (a,)
-        Rotations of the camera around the object that the cable allows, every 5°, and the time of each on this bench.
-    """
+    """The state of the dense search after a view; also ``table_deg``, ``config`` and ``rng``."""
 
     session: hbr.DenseSession
+    """The search, with its ``belief`` and its method ``next_best_view``."""
     decision: hbr.StopDecision
+    """What follows from the views so far."""
     rotations_deg: NDArray[np.float64]
     seconds: NDArray[np.float64]
+    """Rotations of the camera around the object that the cable allows, every 5°, and the time of each on this bench,
+    float64 (a,)."""
 
     @property
     def views(self) -> int:

@@ -203,16 +203,11 @@ def checked(
     time_known: bool = True,
     angle_known: bool = True,
 ) -> Attempt:
-    """Return a frame as an attempt at a view: its evidence, and which limits of a view this exceeds.
+    """Return a frame as an attempt at a view: its evidence (`ViewEvidence`), and which limits of a view this exceeds.
 
-    Parameters
-    ----------
-    settled_ns, locks, locks_hold, stillness, motion
-        See `ViewEvidence`; a frame has either ``stillness`` or ``motion``.
-    early
-        Whether the exposure began before the table came to rest.
-    time_known, angle_known
-        Whether the frame's time can be trusted, and whether encoder and gyro agree about its angle.
+    A frame has either ``stillness`` or ``motion``. An ``early`` one was exposed before the table came to rest.
+    ``time_known`` and ``angle_known`` say whether its time can be trusted, and whether encoder and gyro agree about its
+    angle.
     """
     quality = ImageQuality.of(frame.image_bgr, config)
     evidence = ViewEvidence(

@@ -54,30 +54,21 @@ _TEXT: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescribedView:
-    """The description of a view.
-
-    Attributes
-    ----------
-    levels : mapping of name to uint8 array (length,)
-        Levels of each descriptor; in a search a row for each segmentation.
-    segmentation
-        `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made.
-    table_problem
-        Set for the view with which it is certain that the bench no longer looks like its empty-table image.
-    earlier : tuple of uint8 arrays (k, length), optional
-        In a search: the levels of all earlier views, which were segmented again; a row for each segmentation.
-    reliable
-        In a search: whether the view was segmented by a known background (`hbr.ViewsTogether.reliable`).
-    other_bench
-        In a search: whether the bench is certainly not that of the enrollment.
-    """
+    """The description of a view."""
 
     levels: Mapping[str, NDArray[np.uint8]]
+    """Levels of each descriptor by its name, uint8 (length,); in a search a row for each segmentation."""
     segmentation: dict[str, Any] | None
+    """`hbr.Segmentation.evidence` as JSON values; None if no segmentation was made."""
     table_problem: TableProblem | None = None
+    """Set for the view with which it is certain that the bench no longer looks like its empty-table image."""
     earlier: tuple[NDArray[np.uint8], ...] | None = None
+    """In a search: the levels of all earlier views, uint8 (k, length) each, which were segmented again; a row
+    for each segmentation."""
     reliable: bool = True
+    """In a search: whether the view was segmented by a known background (`hbr.ViewsTogether.reliable`)."""
     other_bench: bool = False
+    """In a search: whether the bench is certainly not that of the enrollment."""
 
 
 def within(image_bgr: NDArray[Value], region: tuple[int, int, int, int] | None) -> NDArray[Value]:

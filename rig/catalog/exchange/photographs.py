@@ -40,23 +40,16 @@ class Photographs:
 
     The name of an image is the path of its file. A file is not read before it is transferred. Each object has one
     complete enrollment, with views by ascending azimuth.
-
-    Attributes
-    ----------
-    origin
-        The folder or the table.
-    folder
-        The folder that contains all files.
-    now
-        Time of the enrollments.
-    rejected
-        What cannot be used, and why.
     """
 
     origin: str
+    """The folder or the table."""
     folder: Path
+    """The folder that contains all files."""
     now: datetime
+    """Time of the enrollments."""
     rejected: list[RejectedFile] = field(default_factory=list)
+    """What cannot be used, and why."""
     _found: dict[str, dict[float, tuple[View, _Row]]] = field(default_factory=dict)
     _empty_tables: dict[tuple[str, float], str] = field(default_factory=dict)
 
@@ -213,16 +206,9 @@ def read_folder(
 ) -> Photographs:
     """Find the photographs of a folder.
 
-    Parameters
-    ----------
-    folder
-        Folder of the photographs. A pattern with slashes also looks into its subfolders.
-    pattern
-        A path without suffix: ``{object}`` and ``{angle}`` (in degrees) once each, ``*`` for any other text.
-    table_angles
-        The angles are table angles under a fixed camera: azimuths run in the opposite direction.
-    now
-        Time of the enrollments.
+    The pattern is a path without suffix: ``{object}`` and ``{angle}`` (in degrees) once each, ``*`` for any other text.
+    One with slashes also looks into the subfolders. ``table_angles`` are those of the table under a fixed camera:
+    azimuths run in the opposite direction. ``now`` is the time of the enrollments.
 
     Raises `UsageError`: the pattern does not contain ``{object}`` and ``{angle}`` once each. `ImportRejected`: there is
     no such folder, or no photograph in it.

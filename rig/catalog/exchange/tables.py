@@ -78,9 +78,7 @@ class TableFormat(StrEnum):
 def write_folder(folder: Path, source: CatalogSource) -> int:
     """Write copies of the images as ``obj{N}__{azimuth}.png``, as in COIL-100, with a table `TABLE`.
 
-    Returns
-    -------
-    Number of objects, as for all formats.
+    It returns the number of objects, as for all formats.
 
     Raises `ExportFailed`: the folder is not empty or cannot be written, or an object has two views from the same
     azimuth.
