@@ -32,7 +32,7 @@ from rig.events.events import Accepted
 from rig.motion.turntable import Turntable
 from rig.plans.steps import capture, moved
 from rig.views.capture import Viewer
-from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
+from rig.views.description import within
 
 NAME = "noise.repeatability"
 
@@ -92,7 +92,6 @@ class Repeatability(Procedure):
             )
         # The operator places the object again each time: views of one placement share its errors.
         viewer = Viewer(bench.camera, bench.config)
-        describe = ViewDescriber(bench.config.view, (PAPER_DESCRIPTOR,))
         placements: list[Placement] = []
         index = 0
         for number in range(1, self.placements + 1):
@@ -113,7 +112,7 @@ class Repeatability(Procedure):
                         captured = yield from capture(index, viewer, table, move.settled_ns)
                         azimuth_deg = (-move.encoder_deg) % 360.0
                         yield Accepted(index, azimuth_deg, captured.evidence, captured.image_bgr)
-                        views.append(describe(captured.image_bgr, azimuth_deg).levels[PAPER_DESCRIPTOR])
+                        views.append(hbr.describe(within(captured.image_bgr, bench.config.view.roi)))
                         index += 1
                     rounds.append(views)
                 table.goto(0.0)

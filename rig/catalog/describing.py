@@ -31,10 +31,9 @@ from rig.core.errors import CatalogDamaged, CatalogError, ExtraMissing, RigError
 from rig.core.files import json_values
 from rig.core.next_steps import Do
 from rig.views.description import (
-    BENCH_DESCRIPTOR,
     DESCRIPTORS,
     EnrollmentDescriber,
-    ViewDescriber,
+    ViewSegmenter,
     check_evidence,
     within,
 )
@@ -122,9 +121,8 @@ def segmented_again(
     """
     image = images.pixels(view.image)
     try:
-        return image, _describer(images, view.region, session.empty_table).segment(
-            image, view.azimuth_deg, segmentation
-        )
+        segmenter = _segmenter(images, view.region, session.empty_table)
+        return image, segmenter.segment(image, view.azimuth_deg, segmentation)
     except ValueError as error:
         raise CatalogDamaged(
             f"The view {view.id} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()
@@ -143,10 +141,10 @@ def silhouette(
 
 
 @lru_cache(maxsize=4)
-def _describer(images: Images, region: Region | None, empty_table: str | None) -> ViewDescriber:
+def _segmenter(images: Images, region: Region | None, empty_table: str | None) -> ViewSegmenter:
     """Return what segments the views of a session; to prepare its empty-table image takes long."""
     table = None if empty_table is None else images.pixels(empty_table)
-    return ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), table)
+    return ViewSegmenter(ViewConfig(roi=region), table)
 
 
 # Compute

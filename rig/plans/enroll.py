@@ -39,7 +39,7 @@ from rig.motion.turntable import Flight, Turntable
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.plans.steps import ObjectCheck, accepted, announced, capture, check_camera, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer, image_similarity
-from rig.views.description import DescribedView, ViewDescriber
+from rig.views.description import DescribedView, ViewSegmenter
 from rig.views.empty_table import empty_table_status
 from rig.views.image_files import encode
 
@@ -69,7 +69,7 @@ class EnrollmentViews:
 
     bench: Bench
     enrollment: OpenEnrollment
-    segment: ViewDescriber
+    segment: ViewSegmenter
     table: Turntable
     viewer: Viewer
     retakes: int = 0
@@ -397,7 +397,7 @@ def enroll(
     if missing:
         try:
             bench.place(enrollment.object_name)
-            segment = ViewDescriber(bench.config.view, empty_table=empty_table)
+            segment = ViewSegmenter(bench.config.view, empty_table=empty_table)
             viewer = Viewer(bench.camera, bench.config, encodes=not in_motion)
             with Turntable(bench) as table:
                 taking = EnrollmentViews(bench, enrollment, segment, table, viewer)

@@ -87,39 +87,29 @@ def within(image_bgr: NDArray[Value], region: tuple[int, int, int, int] | None) 
     return image_bgr[y : y + height, x : x + width]
 
 
-class ViewDescriber:
-    """Segments views of one bench, and describes them by several descriptors.
+class ViewSegmenter:
+    """Segments views of one bench.
 
-    The paper's descriptors describe the whole region of interest. All others describe only the object. Without any
-    descriptor, each view is only segmented; with the paper's alone, it is not. The empty-table images are those of a
-    `TableSheet`, of the same size as the views; the one for the azimuth of a view counts.
-
-    Raises `ValueError`: a descriptor is unknown.
+    The empty-table images are those of a `TableSheet`, of the same size as the views; the one for the azimuth of a view
+    counts.
     """
 
-    def __init__(
-        self, config: ViewConfig, names: tuple[str, ...] = (), empty_table: NDArray[np.uint8] | None = None
-    ) -> None:
+    def __init__(self, config: ViewConfig, empty_table: NDArray[np.uint8] | None = None) -> None:
         self.region = config.roi
-        self._descriptors = [hbr.descriptor(name) for name in names]
-        self._segments = not names or any(not one.whole_image for one in self._descriptors)
-        self.empty_table = empty_table if self._segments else None
+        self.empty_table = empty_table
         self._sheet: TableSheet | None = None
         self._backgrounds: dict[int, hbr.Background] = {}
         self._low: list[float] = []
         self._reported = False
 
     def __call__(self, image_bgr: NDArray[np.uint8], azimuth_deg: float = 0.0) -> DescribedView:
-        """Describe a frame, uint8 (H, W, 3), that the camera took at an azimuth.
+        """Segment a frame, uint8 (H, W, 3), that the camera took at an azimuth.
 
         Raises `UsageError`: the region does not lie within the frame. `ValueError`: the region is too small for a
         segmentation.
         """
-        if not self._segments:
-            return DescribedView(self._levels(within(image_bgr, self.region), None), None)
         found = self.segment(image_bgr, azimuth_deg)
-        levels = self._levels(within(image_bgr, self.region), found)
-        return DescribedView(levels, found.evidence(), self._table_problem(found.agreement))
+        return DescribedView({}, found.evidence(), self._table_problem(found.agreement))
 
     def segment(
         self, image_bgr: NDArray[np.uint8], azimuth_deg: float = 0.0, stored: Mapping[str, Any] | None = None
@@ -133,11 +123,6 @@ class ViewDescriber:
         background, issues = self._prepared_table(image_bgr, azimuth_deg)
         found = stored_segmentation(within(image_bgr, self.region), stored, empty_table=background)
         return replace(found, issues=(*issues, *(one for one in found.issues if one not in issues)))
-
-    def _levels(self, part: NDArray[np.uint8], found: hbr.Segmentation | None) -> dict[str, NDArray[np.uint8]]:
-        return {
-            one.name: one.describe(part if found is None or one.whole_image else found) for one in self._descriptors
-        }
 
     def _table_problem(self, agreement: float | None) -> TableProblem | None:
         """Return a problem after `IN_A_ROW` frames that differ from the empty-table image, but only once."""
@@ -172,23 +157,26 @@ class ViewDescriber:
         return self._backgrounds[number], ()
 
 
-class EnrollmentDescriber(ViewDescriber):
-    """Describes the views of one enrollment together, as a search segments its views.
+class EnrollmentDescriber(ViewSegmenter):
+    """Describes the views of one enrollment together by several descriptors, as a search segments its views.
 
     First it learns the background from all images, one after the other, then it describes each image. It holds no image
-    in memory.
+    in memory. The paper's descriptors describe the whole region of interest, all others only the object.
+
+    Raises `ValueError`: a descriptor is unknown.
     """
 
     def __init__(
         self, config: ViewConfig, names: tuple[str, ...], empty_table: NDArray[np.uint8] | None = None
     ) -> None:
-        super().__init__(config, names, empty_table)
+        super().__init__(config, empty_table)
+        self._descriptors = [hbr.descriptor(name) for name in names]
         self._learned = LearnedBackground()
 
     def learn(self, image_bgr: NDArray[np.uint8]) -> int:
         """Learn the background from the next view, uint8 (H, W, 3); return the number of the view.
 
-        Raises `UsageError`, `ValueError`: as for `ViewDescriber`, or the view has another size than the others.
+        Raises `UsageError`, `ValueError`: as for `ViewSegmenter`, or the view has another size than the others.
         """
         self._learned.add(within(image_bgr, self.region))
         return len(self._learned) - 1
@@ -201,11 +189,14 @@ class EnrollmentDescriber(ViewDescriber):
         if found.box is None:
             found = hbr.segment(frame, empty_table=background)
         found = replace(found, issues=(*issues, *found.issues))
-        return DescribedView(self._levels(frame.image, found), evidence_together(found, len(self._learned)))
+        levels = {one.name: one.describe(frame.image if one.whole_image else found) for one in self._descriptors}
+        return DescribedView(levels, evidence_together(found, len(self._learned)))
 
 
-class SearchDescriber(ViewDescriber):
+class SearchDescriber(ViewSegmenter):
     """Describes the views of one search by one descriptor, with several segmentations of each view.
+
+    The paper's descriptors need no segmentation: they describe the whole region of interest.
 
     The background is learned from all views of the search, so that each view also improves the earlier ones
     (`hbr.ViewsTogether`). The levels have a row for each segmentation.
@@ -223,11 +214,10 @@ class SearchDescriber(ViewDescriber):
         revise: bool = True,
         enrolled_table: NDArray[np.uint8] | None = None,
     ) -> None:
-        super().__init__(config, (name,), empty_table)
-        self._name = name
+        self._kind = hbr.descriptor(name)
+        super().__init__(config, None if self._kind.whole_image else empty_table)
         self._revise = revise
         self._enrolled_table = enrolled_table
-        self._table = empty_table
         self._other_bench = False
         self._views: hbr.ViewsTogether | None = None
 
@@ -237,16 +227,16 @@ class SearchDescriber(ViewDescriber):
         return [] if self._views is None else self._views.segmentations
 
     def __call__(self, image_bgr: NDArray[np.uint8], azimuth_deg: float = 0.0) -> DescribedView:
-        """Describe the next frame of the search; errors as for `ViewDescriber`."""
-        if not self._segments:
-            return super().__call__(image_bgr, azimuth_deg)
+        """Describe the next frame of the search; errors as for `ViewSegmenter`."""
         part = within(image_bgr, self.region)
+        if self._kind.whole_image:
+            return DescribedView({self._kind.name: self._kind.describe(part)}, None)
         background, issues = self._prepared_table(image_bgr, azimuth_deg)
         if self._views is None:
-            self._views = hbr.ViewsTogether(self._name)
+            self._views = hbr.ViewsTogether(self._kind.name)
         found = self._views.add(part, background, revise=self._revise, keep=self._revise)[0]
         if len(self._views.segmentations) == 1:
-            before, now = (table_image(one, image_bgr, azimuth_deg) for one in (self._enrolled_table, self._table))
+            before, now = (table_image(one, image_bgr, azimuth_deg) for one in (self._enrolled_table, self.empty_table))
             if before is not None and now is not None:
                 table = hbr.Background(within(before, self.region))
                 self._other_bench = table.shows_another_bench(within(now, self.region))
@@ -255,7 +245,7 @@ class SearchDescriber(ViewDescriber):
         problem = self._table_problem(found.agreement)
         revised = tuple(earlier) if self._revise else None
         return DescribedView(
-            {self._name: levels}, found.evidence(), problem, revised, self._views.reliable, self._other_bench
+            {self._kind.name: levels}, found.evidence(), problem, revised, self._views.reliable, self._other_bench
         )
 
 

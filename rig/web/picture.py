@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rig.bench import Bench
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import RigError
-from rig.views.description import ViewDescriber, within
+from rig.views.description import ViewSegmenter, within
 from rig.views.empty_table import empty_table_status
 
 JPEG_QUALITY: Final = 80  # for the eye only; no descriptor sees it
@@ -72,7 +72,7 @@ class Outliner:
     def __init__(self, bench: Bench) -> None:
         self._region = bench.config.view.roi
         status = empty_table_status(bench)
-        self._describer = ViewDescriber(
+        self._describer = ViewSegmenter(
             bench.config.view, empty_table=None if status.table is None else status.table.image_bgr
         )
 

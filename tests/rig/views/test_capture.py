@@ -20,7 +20,7 @@ from rig.views.capture import (
     Viewer,
     rejection_text,
 )
-from rig.views.description import ViewDescriber
+from rig.views.description import SearchDescriber
 from tests.rig.bench_parts import at_rest
 
 
@@ -156,7 +156,7 @@ def test_region_of_interest_is_described(on_the_table):
     s, table, viewer = on_the_table
     (attempt,) = attempts_of(s, table, viewer)
     x, y, width, height = s.bench.config.view.roi
-    levels = ViewDescriber(s.bench.config.view, ("cedd",))(attempt.image_bgr).levels["cedd"]
+    levels = SearchDescriber(s.bench.config.view, "cedd")(attempt.image_bgr).levels["cedd"]
     assert (levels == hbr.describe(attempt.image_bgr[y : y + height, x : x + width])).all()
 
 

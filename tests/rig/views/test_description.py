@@ -17,7 +17,7 @@ from rig.views.description import (
     EnrollmentDescriber,
     SearchDescriber,
     SegmentationSummary,
-    ViewDescriber,
+    ViewSegmenter,
 )
 
 WHOLE = ViewConfig(roi=None)
@@ -39,14 +39,15 @@ def _with_object(table: NDArray[np.uint8], left: int = 60, gain: float = 1.0) ->
 
 def test_paper_descriptor_describes_the_whole_region() -> None:
     frame = _with_object(_table())
-    described = ViewDescriber(ViewConfig(roi=(20, 0, 120, 120)), DESCRIPTORS, _table())(frame)
+    describer = EnrollmentDescriber(ViewConfig(roi=(20, 0, 120, 120)), DESCRIPTORS, _table())
+    described = describer.describe(describer.learn(frame), frame)
     assert tuple(described.levels) == DESCRIPTORS
     assert np.array_equal(described.levels[PAPER_DESCRIPTOR], hbr.describe(frame[:, 20:140]))
 
 
 def test_object_is_found_in_the_region_of_interest() -> None:
     table = _table()
-    described = ViewDescriber(ViewConfig(roi=(20, 0, 120, 120)), empty_table=table)(_with_object(table))
+    described = ViewSegmenter(ViewConfig(roi=(20, 0, 120, 120)), empty_table=table)(_with_object(table))
     assert described.segmentation is not None
     x, y, width, height = described.segmentation["box_px"]
     assert np.allclose((x, y, x + width, y + height), (40, 40, 80, 90), atol=4)
@@ -56,16 +57,14 @@ def test_object_is_found_in_the_region_of_interest() -> None:
 def test_position_and_illumination_change_edges_and_colours_little() -> None:
     table = _table()
     kind = hbr.descriptor("edges=0.5,colours=0.5")  # CEDD depends more on the illumination
-    describer = ViewDescriber(WHOLE, (kind.name,), table)
-    before = describer(_with_object(table)).levels[kind.name]
-    after = describer(_with_object(table, left=72, gain=0.8)).levels[kind.name]
-    other = describer(_with_object(table)[::-1, ::-1].copy()).levels[kind.name]
+    images = _with_object(table), _with_object(table, left=72, gain=0.8), _with_object(table)[::-1, ::-1].copy()
+    before, after, other = (kind.describe(ViewSegmenter(WHOLE, table).segment(image)) for image in images)
     assert float(kind.similarity(before[None], after[None])[0, 0]) > 0.95
     assert float(kind.similarity(before[None], other[None])[0, 0]) < 0.9
 
 
 def test_descriptors_of_the_whole_image_need_no_segmentation() -> None:
-    described = ViewDescriber(WHOLE, (PAPER_DESCRIPTOR, "cedd-blurred"))(_with_object(_table())[:12, :15])
+    described = SearchDescriber(WHOLE, PAPER_DESCRIPTOR)(_with_object(_table())[:12, :15])
     assert described.segmentation is None
 
 
@@ -84,36 +83,27 @@ def test_search_in_motion_learns_the_background_and_leaves_earlier_views_alone()
 
 def test_empty_table_image_of_another_size_is_not_used_and_reported() -> None:
     frame = _with_object(np.full((120, 160, 3), 128, np.uint8))
-    without = ViewDescriber(WHOLE, DESCRIPTORS)(frame)
-    described = ViewDescriber(WHOLE, DESCRIPTORS, _table(240, 320))(frame)
-    assert described.segmentation is not None
-    issue = described.segmentation["issues"][0]
+    without, found = (ViewSegmenter(WHOLE, table).segment(frame) for table in (None, _table(240, 320)))
+    issue = found.evidence()["issues"][0]
     assert issue == {"code": "empty-table-size", "table_px": [320, 240], "frame_px": [160, 120]}
-    assert np.array_equal(described.levels[BENCH_DESCRIPTOR], without.levels[BENCH_DESCRIPTOR])
+    levels, expected = map(hbr.descriptor(BENCH_DESCRIPTOR).describe, (found, without))
+    assert np.array_equal(levels, expected)
 
 
 def test_region_outside_the_frame_is_rejected() -> None:
     with pytest.raises(UsageError, match="does not lie within"):
-        ViewDescriber(ViewConfig(roi=(100, 0, 100, 100)))(_table())
+        ViewSegmenter(ViewConfig(roi=(100, 0, 100, 100)))(_table())
 
 
 def test_three_frames_in_a_row_that_differ_are_reported_once() -> None:
     table = _table()
     good, bad = _with_object(table), _with_object(table[::-1, ::-1].copy())
-    describe = ViewDescriber(WHOLE, (BENCH_DESCRIPTOR,), table)
+    describe = ViewSegmenter(WHOLE, table)
     problems = [describe(frame).table_problem for frame in (bad, bad, good, bad, bad, bad, bad)]
     assert [problem is not None for problem in problems] == [False] * 5 + [True, False]
     assert problems[5] is not None
     assert problems[5].parameters["frames"] == 3
     assert problems[5].parameters["agreement"] < 0.65
-
-
-def test_view_is_only_segmented_without_descriptors_and_silhouettes_are_those_of_a_description() -> None:
-    table = _table()
-    frame = _with_object(table)
-    segmented = ViewDescriber(WHOLE, empty_table=table)(frame)
-    assert segmented.levels == {}
-    assert segmented.segmentation == ViewDescriber(WHOLE, DESCRIPTORS, table)(frame).segmentation
 
 
 def test_enrolled_view_keeps_its_silhouette() -> None:
@@ -125,7 +115,7 @@ def test_enrolled_view_keeps_its_silhouette() -> None:
     enrolled = together.describe(1, frames[1])
     assert enrolled.segmentation is not None
     assert enrolled.segmentation["together"] == 3
-    cut = ViewDescriber(WHOLE).segment(frames[1], 0.0, enrolled.segmentation)
+    cut = ViewSegmenter(WHOLE).segment(frames[1], 0.0, enrolled.segmentation)
     levels = hbr.descriptor(BENCH_DESCRIPTOR).describe(cut)
     assert np.array_equal(levels, enrolled.levels[BENCH_DESCRIPTOR])
 
