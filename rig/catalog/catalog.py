@@ -231,13 +231,13 @@ class Catalog(AbstractContextManager["Catalog"]):
             enrollment.digest = digest_of(enrollment, enrollment.key)
             transaction.add(enrollment)
             transaction.flush()
-            changed_texts = known is None or bool(texts)
+            changed = state.new_columns(now, texts) if known is None else state.columns(known, texts) if texts else {}
             log.append(
                 transaction,
                 self.clock,
                 Action.ENROLLMENT_STARTED,
                 name,
-                **{**(state.columns(known, now, texts) if changed_texts else {}), "object_id": object_id},
+                **{**changed, "object_id": object_id},
                 enrollment_id=enrollment.id,
                 status=EnrollmentStatus.IN_PROGRESS,
                 details={"enrollment_id": enrollment.id, "views": len(plan), "replace": replace},
@@ -265,13 +265,8 @@ class Catalog(AbstractContextManager["Catalog"]):
             found = state.find(transaction, name)
             enrollment = state.unfinished(transaction, found).enrollment
             name = str(found.object_name)
-            log.append(
-                transaction,
-                self.clock,
-                Action.ENROLLMENT_RESUMED,
-                name,
-                details={"enrollment_id": enrollment.id},
-            )
+            details = {"enrollment_id": enrollment.id}
+            log.append(transaction, self.clock, Action.ENROLLMENT_RESUMED, name, details=details)
             return self._start_session(transaction, enrollment, name, provenance, png)
 
     # Change objects
@@ -288,9 +283,8 @@ class Catalog(AbstractContextManager["Catalog"]):
             if new_name == known.object_name:
                 return
             state.check_free(transaction, new_name)
-            columns = state.columns(known, known.time_utc)
             before = {"before": known.object_name}
-            log.append(transaction, self.clock, Action.RENAMED, new_name, **columns, details=before)
+            log.append(transaction, self.clock, Action.RENAMED, new_name, **state.columns(known), details=before)
 
     def set_texts(self, name: str, *, label: str | None = None, note: str | None = None) -> None:
         """Change the label and the note of an object. None leaves them unchanged.
@@ -301,7 +295,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.write() as transaction:
             known = state.find(transaction, name)
             if texts:
-                columns = state.columns(known, known.time_utc, texts)
+                columns = state.columns(known, texts)
                 log.append(transaction, self.clock, Action.LABELLED, known.object_name, **columns, details=texts)
 
     def delete(self, *names: str) -> None:
@@ -311,7 +305,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         with self.database.write() as transaction:
             for known in [state.find(transaction, name) for name in dict.fromkeys(names)]:
-                columns = state.columns(known, known.time_utc, deleted=True)
+                columns = state.columns(known, deleted=True)
                 log.append(transaction, self.clock, Action.DELETED, known.object_name, **columns)
 
     def undelete(self, name: str) -> None:
@@ -323,8 +317,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.write() as transaction:
             known = state.find(transaction, name, deleted=True)
             state.check_free(transaction, str(known.object_name))
-            columns = state.columns(known, known.time_utc)
-            log.append(transaction, self.clock, Action.UNDELETED, known.object_name, **columns)
+            log.append(transaction, self.clock, Action.UNDELETED, known.object_name, **state.columns(known))
 
     # The log
 
@@ -492,7 +485,7 @@ class OpenEnrollment:
             object_id = self.enrollment.object_id
             others = transaction.scalar(select(Enrollment.id).where(Enrollment.object_id == object_id).limit(1))
             known = state.by_id(transaction, object_id)
-            gone = state.columns(known, self.session.started_utc, deleted=True)
+            gone = state.columns(known, deleted=True)
             log.append(
                 transaction,
                 self.catalog.clock,

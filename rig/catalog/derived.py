@@ -7,7 +7,7 @@ missing, old or damaged result is computed again, so the table can be emptied at
 Decision: docs/decisions/0010.
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -30,7 +30,7 @@ from rig.catalog.describing import (
     stored_contents,
 )
 from rig.catalog.facts import Enrollment, Session, View, seal_of
-from rig.catalog.jobs import JobProgress, finished, processes
+from rig.catalog.jobs import JobProgress, processes
 from rig.catalog.records import Region
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
@@ -38,10 +38,12 @@ from rig.core.processes import map_in_processes
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR
 
 
-def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None, hbr.Views]:
+def views(
+    catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, progress: Callable[[JobProgress], None] | None = None
+) -> hbr.Views:
     """Return the views of every complete enrollment of the objects in use, by object and index.
 
-    It yields its progress in enrollments while it describes those that are not described yet.
+    ``progress`` is called with the number of enrollments while it describes those that are not described yet.
 
     Raises `UsageError`: there is no such descriptor. `CatalogError`: a view that is not described yet cannot be
     described.
@@ -57,8 +59,9 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
             if one.seal not in found:
                 (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
                 missing.append((one.name, known.enrollment))
+    report = progress or (lambda _: None)
     if missing:
-        yield JobProgress(0, len(missing))
+        report(JobProgress(0, len(missing)))
     count = sum(len(enrollment.views) for _, enrollment in missing)
     work = partial(describe_one, catalog.database.images, together)
     failed = ""
@@ -69,7 +72,7 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
             seal = seal_of(enrollment)
             store(catalog.database, seal, contents)
             found[seal] = contents[kind.name]
-        yield JobProgress(done, len(missing))
+        report(JobProgress(done, len(missing)))
     if failed:
         raise CatalogError(failed, next_step=Do.VERIFY_CATALOG())
     if not wanted:
@@ -86,18 +89,6 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
         tuple(one.name for one in wanted),
         kind.name,
     )
-
-
-def views(
-    catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, progress: Callable[[JobProgress], None] | None = None
-) -> hbr.Views:
-    """Return the views of `load_views`; ``progress`` is called while it describes some."""
-
-    def show(at: JobProgress) -> None:
-        if progress is not None and at.total:
-            progress(at)
-
-    return finished(load_views(catalog, descriptor), show)
 
 
 def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:

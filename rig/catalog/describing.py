@@ -30,13 +30,7 @@ from rig.config import ViewConfig
 from rig.core.errors import CatalogDamaged, CatalogError, ExtraMissing, RigError, UsageError
 from rig.core.files import json_values
 from rig.core.next_steps import Do
-from rig.views.description import (
-    DESCRIPTORS,
-    EnrollmentDescriber,
-    ViewSegmenter,
-    check_evidence,
-    within,
-)
+from rig.views.description import DESCRIPTORS, EnrollmentDescriber, ViewSegmenter, check_evidence, within
 
 SEGMENTATION: Final = "segmentation"
 """The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.segment`)."""

@@ -115,7 +115,6 @@ def read_images(
 
 
 def _images(enrollment: Enrollment) -> list[str]:
-    """Return the images of an enrollment, each once."""
     tables = [session.empty_table for session in enrollment.sessions if session.empty_table is not None]
     return list(dict.fromkeys([*(view.image for view in enrollment.views), *tables]))
 

@@ -256,8 +256,7 @@ def _forget(journal: Catalog, name: str, key: str) -> None:
         complete = state.of_status(transaction, known, EnrollmentStatus.COMPLETE)
         again = state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS) is not None
         if not again and complete is not None and complete.enrollment.key == key:
-            columns = state.columns(known, known.time_utc, deleted=True)
-            log.append(transaction, journal.clock, Action.DELETED, name, **columns)
+            log.append(transaction, journal.clock, Action.DELETED, name, **state.columns(known, deleted=True))
 
 
 def _is_waiting(transaction: Transaction) -> ColumnElement[bool]:
@@ -390,7 +389,6 @@ class BackgroundDelivery(AbstractContextManager["BackgroundDelivery"]):
                 return
 
     def _attempt(self) -> JournalState:
-        """Deliver what is in the journal; return what stays there."""
         left = self.state.waiting
         try:
             left = waiting(self.place, self.clock)

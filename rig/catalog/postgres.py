@@ -106,12 +106,15 @@ class PostgresDatabase(Database):
 
     def _open(self, *, create: bool) -> None:
         with self._changes.begin() as connection:
-            exists = _has_tables(connection)
-        if not exists:
-            if not create:
-                raise _absent(self.place)
-            self._create()
-        with self._changes.begin() as connection:
+            if not _has_tables(connection):
+                if not create:
+                    raise CatalogError(
+                        f"The database {self.place} has no catalog.",
+                        next_step=("Check catalog.url, or", Do.ENROLL(), "This creates the catalog."),
+                    )
+                connection.execute(select(func.pg_advisory_xact_lock(_CREATION)))
+                if not _has_tables(connection):  # else another process was faster
+                    create_tables(connection)
             found = properties(connection)
         check_properties(found, self.place)
         self.id = found["id"]
@@ -137,20 +140,6 @@ class PostgresDatabase(Database):
             raise CatalogError(f"The images of the catalog {self.place} are not in {where}.", next_step=fix)
         if not self.read_only:
             self.images.set_mark(self.id)
-
-    def _create(self) -> None:
-        with self._changes.begin() as connection:
-            connection.execute(select(func.pg_advisory_xact_lock(_CREATION)))
-            if _has_tables(connection):
-                return  # another process was faster
-            create_tables(connection)
-
-
-def _absent(place: CatalogPlace) -> CatalogError:
-    return CatalogError(
-        f"The database {place} has no catalog.",
-        next_step=("Check catalog.url, or", Do.ENROLL(), "This creates the catalog."),
-    )
 
 
 def limit_idle(connection: Connection, seconds: int) -> None:

@@ -63,6 +63,13 @@ _USED = (
     .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
     .order_by(Named.object_id)
 )
+_OWNED = (
+    select(Enrollment.id, Ended.seal, Enrollment.object_id, Ended.object_id, Named.object_name)
+    .select_from(Enrollment)
+    .outerjoin(Ended, and_(Ended.enrollment_id == Enrollment.id, IS_STATUS))
+    .outerjoin(Named, and_(Named.object_id == Enrollment.object_id, IS_STATE))
+    .order_by(Enrollment.id)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,20 +225,15 @@ def by_id(transaction: Transaction, object_id: int | None) -> Entry:
     return found
 
 
-def columns(
-    known: Entry | None, now: datetime, texts: Mapping[str, str] | None = None, *, deleted: bool = False
-) -> dict[str, Any]:
-    """Return the columns of a line of the log that gives an object this state; other texts stay as they are."""
-    label, note = ("", "") if known is None else (known.label or "", known.note or "")
-    created_utc = now if known is None else known.created_utc
-    found: dict[str, Any] = {
-        "label": label,
-        "note": note,
-        "deleted": deleted,
-        "created_utc": created_utc,
-        **(texts or {}),
-    }
-    return found if known is None else {**found, "object_id": known.object_id}
+def new_columns(created_utc: datetime, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return the columns of the line of the log that adds an object."""
+    return {"label": "", "note": "", "deleted": False, "created_utc": created_utc, **texts}
+
+
+def columns(known: Entry, texts: Mapping[str, str] | None = None, *, deleted: bool = False) -> dict[str, Any]:
+    """Return the columns of a line of the log that gives a known object this state; other texts stay as they are."""
+    own = {"label": known.label or "", "note": known.note or "", "created_utc": known.created_utc}
+    return {**own, "object_id": known.object_id, "deleted": deleted, **(texts or {})}
 
 
 def check_free(transaction: Transaction, name: str) -> None:
@@ -455,14 +457,13 @@ def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
 def check(transaction: Transaction) -> None:
     """Raise `CatalogDamaged` if objects or enrollments are not as they were written."""
     check_fold(transaction)
-    rows = transaction.execute(
-        select(Enrollment.id, Ended.seal, Ended.object_id, Enrollment.object_id)
-        .join(Ended, Ended.enrollment_id == Enrollment.id)
-        .where(IS_STATUS)
-    ).all()
-    owner = {row[0]: row[2] for row in rows}
-    wrong = [row[2] for row in rows if row[2] != row[3]]
-    wrong += [owner[one] for one in digests.damaged_enrollments(transaction, {row[0]: row[1] for row in rows})]
-    if wrong:
-        raise changed([str(by_id(transaction, one).object_name) for one in dict.fromkeys(wrong)])
+    if wrong := damaged_enrollments(transaction):
+        raise changed([str(name) for name in wrong.values()])
     used(transaction)
+
+
+def damaged_enrollments(transaction: Transaction, ids: Collection[int] | None = None) -> dict[int, str | None]:
+    """Return which enrollments, of these or of all, are not as they were written, with the names of their objects."""
+    rows = transaction.execute(_OWNED if ids is None else _OWNED.where(Enrollment.id.in_(ids))).all()
+    wrong = set(digests.damaged_enrollments(transaction, {number: seal for number, seal, *_ in rows}))
+    return {number: name for number, _, owner, in_log, name in rows if number in wrong or owner != in_log}

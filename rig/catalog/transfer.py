@@ -19,18 +19,7 @@ from sqlalchemy.orm import Session as Transaction
 from rig.catalog import describing, digests, log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
-from rig.catalog.facts import (
-    Action,
-    Derived,
-    Enrollment,
-    Entry,
-    Session,
-    View,
-    digest_of,
-    digested,
-    seal_of,
-    sha256_of,
-)
+from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, digest_of, digested, seal_of, sha256_of
 from rig.catalog.incoming import OTHER_IMAGE, ImportProblem, ReadImages, Reading, RejectedFile, read_images
 from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
@@ -371,7 +360,6 @@ class _Plan:
 
 
 def _ids(transaction: Transaction, names: Sequence[str]) -> dict[str, int]:
-    """Return the ids of the objects in use with these names."""
     found: dict[str, int] = {}
     for part in portions(names, 500):
         rows = transaction.execute(
@@ -404,7 +392,7 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
         columns = state.ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
         if known is None:
             texts = {"label": item.label or label or "", "note": item.note}
-            columns |= state.columns(None, item.created_utc, texts)
+            columns |= state.new_columns(item.created_utc, texts)
         log.append(transaction, target.clock, Action.IMPORTED, item.name, **columns)
     return new
 

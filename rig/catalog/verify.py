@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 from sqlalchemy import and_, func, select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import describing, digests, log, state
+from rig.catalog import describing, log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.facts import Derived, Enrollment, Entry, View
 from rig.catalog.images import Images, path_of
@@ -28,7 +28,6 @@ _ENROLLMENTS: Final = 10
 """Enrollments in a portion: few rows are in memory at once."""
 _IMAGE: Final = NAMED_IMAGES.c
 _OWNS: Final = and_(Named.object_id == Enrollment.object_id, state.IS_STATE)
-_STATUS: Final = and_(Ended.enrollment_id == Enrollment.id, state.IS_STATUS)
 
 
 class CatalogProblem(StrEnum):
@@ -108,7 +107,10 @@ def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgres
         results = transaction.scalar(select(func.max(Entry.result))) or 0
         images = transaction.scalar(select(func.count(_IMAGE.image))) or 0
         damages = dict.fromkeys(catalog.database.damage(transaction))  # in their order, each once
-        for check in (*_row_checks(transaction), _derived):
+        ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
+        checks: list[Callable[[Transaction], Iterator[CatalogFinding]]] = [_lines, _missing]
+        checks += [partial(_enrollments, part) for part in portions(ids, _ENROLLMENTS)]
+        for check in (*checks, _derived):
             try:
                 findings += check(transaction)
             except CatalogDamaged as damage:  # a row that cannot be read
@@ -128,24 +130,13 @@ def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgres
     return CatalogVerification(objects, views, results, image_bytes, (*damaged, *findings, *of_images))
 
 
-def _row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Iterator[CatalogFinding]]]:
-    """Yield the checks of the log and of portions of the enrollments."""
-    ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
-    yield from (_lines, _end, _missing)
-    yield from (partial(_enrollments, part) for part in portions(ids, _ENROLLMENTS))
-
-
 def _lines(transaction: Transaction) -> Iterator[CatalogFinding]:
     for number in log.wrong_lines(transaction):
         name = None
         with suppress(CatalogDamaged):  # the name itself may be damaged
             name = transaction.scalar(select(Entry.object_name).where(Entry.id == number))
         yield CatalogFinding(CatalogProblem.LOG_CHANGED, name, details={"entry_id": number})
-
-
-def _end(transaction: Transaction) -> Iterator[CatalogFinding]:
-    log.check_complete(transaction)
-    yield from ()
+    log.check_complete(transaction)  # its error is one more finding
 
 
 def _missing(transaction: Transaction) -> Iterator[CatalogFinding]:
@@ -154,13 +145,8 @@ def _missing(transaction: Transaction) -> Iterator[CatalogFinding]:
 
 
 def _enrollments(ids: Sequence[int], transaction: Transaction) -> Iterator[CatalogFinding]:
-    columns = (Enrollment.id, Enrollment.object_id, Named.object_name, Ended.object_id, Ended.seal)
-    found = select(*columns).select_from(Enrollment).outerjoin(Named, _OWNS).outerjoin(Ended, _STATUS)
-    rows = transaction.execute(found.where(Enrollment.id.in_(ids)).order_by(Enrollment.id)).all()
-    wrong = set(digests.damaged_enrollments(transaction, {number: seal for number, *_, seal in rows}))
-    for number, owner, name, owner_in_log, _ in rows:
-        if number in wrong or owner != owner_in_log:
-            yield CatalogFinding(CatalogProblem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number})
+    for number, name in state.damaged_enrollments(transaction, ids).items():
+        yield CatalogFinding(CatalogProblem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number})
 
 
 def _derived(transaction: Transaction) -> Iterator[CatalogFinding]:

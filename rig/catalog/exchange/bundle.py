@@ -23,10 +23,11 @@ from sqlalchemy import func, select
 from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.exchange.new_files import new_file
-from rig.catalog.facts import Enrollment, Session, View
+from rig.catalog.facts import Enrollment
 from rig.catalog.images import Images, name_of, path_of
 from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
+from rig.catalog.upkeep import NAMED_IMAGES
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.clock import Clock
 from rig.core.errors import ExportFailed, ImportRejected, RigError
@@ -40,6 +41,7 @@ MAX_DATABASE_BYTES: Final = 2_000_000_000
 MAX_RATIO: Final = 250
 """Largest ratio of the sizes unpacked and packed. A database of such records reaches 40."""
 
+_IMAGE: Final = NAMED_IMAGES.c
 _DATE: Final = (1980, 1, 1, 0, 0, 0)  # ZIP's earliest: the same objects give the same bytes
 
 
@@ -219,12 +221,8 @@ def _check_content(path: Path, catalog: Catalog, sizes: Mapping[str, int]) -> No
     with catalog.database.read() as transaction:
         if transaction.scalar(select(func.count(Enrollment.id))) != len(state.used(transaction)):
             raise _rejected(path, "it contains an enrollment that is not complete or not in use")
-        tables = select(Session.empty_table, Session.empty_table_bytes).where(Session.empty_table.is_not(None))
-        named = {
-            str(name): size
-            for query in (select(View.image, View.image_bytes), tables)
-            for name, size in transaction.execute(query)
-        }
+        of_enrollments = select(_IMAGE.image, _IMAGE.image_bytes).where(_IMAGE.enrollment_id.is_not(None))
+        named = {str(name): size for name, size in transaction.execute(of_enrollments)}
     for name, size in named.items():
         if path_of(name) not in sizes:
             raise _rejected(path, f"the image {path_of(name)!r} is missing")

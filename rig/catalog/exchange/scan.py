@@ -242,7 +242,6 @@ def _directory(fields: dict[int, Any], at: int) -> bytes:
 
 
 def _field(tag: int, value: Any) -> tuple[int, int, bytes]:
-    """Return type, count and bytes of a value."""
     match value:
         case str():
             text = value.encode("ascii", "replace") + b"\0"

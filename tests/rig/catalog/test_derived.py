@@ -208,9 +208,16 @@ def test_another_descriptor_is_described_when_it_is_asked_for(catalog: Catalog) 
 def test_an_interrupted_description_continues(catalog: Catalog) -> None:
     before = load(catalog)[0]
     forget(catalog)
-    loading = derived.load_views(catalog, BENCH_DESCRIPTOR)
-    assert [next(loading).done for _ in range(2)] == [0, 1]
-    loading.close()
+    shown = []
+
+    def interrupt(progress: JobProgress) -> None:
+        shown.append(progress.done)
+        if progress.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        derived.views(catalog, BENCH_DESCRIPTOR, interrupt)
+    assert shown == [0, 1]
     after, described = load(catalog)
     assert (described, equal(before, after)) == (len(NAMES) - 1, True)
 
