@@ -124,7 +124,6 @@ def _decided(search: Search, saved: Decided) -> Decided | dict[str, Any]:
 
 
 def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[ReplayDifference]:
-    """Yield the differences, field by field."""
     if isinstance(saved, dict) and isinstance(computed, dict):
         for key in {**saved, **computed}:
             yield from _compare(view, f"{where}.{key}" if where else key, saved.get(key), computed.get(key))

@@ -231,7 +231,6 @@ def load_run(folder: Path) -> SavedRun:
 
 
 def _frame_file(index: int) -> str:
-    """Return the file of the frame of an accepted view."""
     return f"frames/{index:03d}.png"
 
 
@@ -317,6 +316,5 @@ def _damaged(folder: Path, reason: str) -> UsageError:
 
 
 def _writing(folder: Path) -> AbstractContextManager[None]:
-    """Return a context in which an error of the system says that the run cannot be saved."""
     step = ("Give a new folder, on a disk with space.", Do.RUN_AGAIN(save_run="FOLDER"))
     return os_errors_as(UsageError, f"The run cannot be saved in {folder}.", next_step=step)

@@ -188,34 +188,44 @@ def _no_step() -> Asking[None]:
     yield from ()
 
 
-def _min_score(views: hbr.Views, config: RigConfig) -> float:
-    """Return the score per view below which an object is unknown in the paper's search and its successor's."""
-    given = config.identify.min_score
-    return hbr.open_set_threshold(views, repeatability=config.identify.repeatability) if given is None else given
+class _PaperSearch(Search):
+    """A search of the paper or of its successor: a score per view tells whether the object is unknown."""
+
+    def __init__(self, views: hbr.Views, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
+        super().__init__(views, config, strategy, seed=seed, top=top)
+        self._views = views
+        given, repeatability = config.identify.min_score, config.identify.repeatability
+        self._min_score = hbr.open_set_threshold(views, repeatability=repeatability) if given is None else given
+
+    def _by_score(self, answer: Identified, possible: Sequence[str], object_index: int, **others: Any) -> Identified:
+        """Return the answer by its score and its possible objects, with all rotations by the measured symmetry."""
+        outcome = hbr.Outcome.FOUND if len(possible) == 1 else hbr.Outcome.AMBIGUOUS
+        if answer.score < self._min_score:
+            outcome, possible = hbr.Outcome.UNKNOWN, ()
+        own = symmetry(self._views, object_index)
+        period_deg = own.period_deg if own else None
+        poses = round(360 / period_deg) if period_deg else 1 if period_deg is None else 0
+        yaw_deg = answer.yaw_set_deg[0]
+        return replace(
+            answer,
+            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
+            outcome=outcome,
+            possible=tuple(possible),
+            min_score=self._min_score,
+            yaw_deg=yaw_deg if poses == 1 else None,
+            yaw_set_deg=tuple(wrap360(yaw_deg + k * 360 / poses) for k in range(poses)),
+            period_deg=period_deg,
+            **others,
+        )
 
 
-def _with_symmetry(answer: Identified, views: hbr.Views, object_index: int) -> Identified:
-    """Return an answer with all rotations that look the same, by the symmetry that the enrollment measured."""
-    own = symmetry(views, object_index)
-    period_deg = own.period_deg if own else None
-    poses = round(360 / period_deg) if period_deg else 1 if period_deg is None else 0
-    yaw_deg = answer.yaw_set_deg[0]
-    return replace(
-        answer,
-        yaw_deg=yaw_deg if poses == 1 else None,
-        yaw_set_deg=tuple(wrap360(yaw_deg + k * 360 / poses) for k in range(poses)),
-        period_deg=period_deg,
-    )
-
-
-class HoughSearch(Search):
+class HoughSearch(_PaperSearch):
     """The paper's search: views vote by lists of the most similar enrolled views (`hbr.retrieve`)."""
 
     def __init__(
         self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int
     ) -> None:
         super().__init__(index.views, config, strategy, seed=seed, top=top)
-        self._min_score = _min_score(index.views, config)
         self._index = index
         self._descriptors: list[NDArray[np.uint8]] = []
 
@@ -256,24 +266,16 @@ class HoughSearch(Search):
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
-        outcome, possible = hbr.Outcome.FOUND, answer.possible
-        if answer.score < self._min_score:
-            outcome, possible = hbr.Outcome.UNKNOWN, ()
-        elif answer.margin <= 0 and len(self._ranking.names) > 1:
+        possible = answer.possible
+        if answer.margin <= 0 and len(self._ranking.names) > 1:
             # Objects that share the best score; at least the second one, which is as likely by the margin.
-            outcome, scores = hbr.Outcome.AMBIGUOUS, self._ranking.scores
+            scores = self._ranking.scores
             possible = self._ranking.names[: max(2, int((scores >= scores[0]).sum()))]
-        return replace(
-            _with_symmetry(answer, self._index.views, int(self._ranking.object_index[0])),
-            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
-            outcome=outcome,
-            possible=possible,
-            min_score=self._min_score,
-            min_margin=self._config.identify.margin,
-        )
+        first = int(self._ranking.object_index[0])
+        return self._by_score(answer, possible, first, min_margin=self._config.identify.margin)
 
 
-class PoseSearch(Search):
+class PoseSearch(_PaperSearch):
     """The search of the paper's successor: a hidden Markov model over the poses of all objects (`hbr.paper.hmm`).
 
     The probabilities are shares among the enrolled objects, because the model knows no other. Whether the object is
@@ -290,7 +292,6 @@ class PoseSearch(Search):
         self._rows, _ = model.views.by_object
         self._begin = model.begin
         self._with_views = model.views.object_index[self._rows[model.begin]]
-        self._min_score = _min_score(model.views, config)
         self._reach = np.zeros(len(model.begin))
 
     def _add(self, view: DescribedView) -> None:
@@ -323,20 +324,11 @@ class PoseSearch(Search):
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
-        outcome, possible = hbr.Outcome.FOUND, 1 + int((np.cumsum(self._probability) < CONFIDENT).sum())
-        if answer.score < self._min_score:
-            outcome, possible = hbr.Outcome.UNKNOWN, 0
-        elif possible > 1:
-            outcome = hbr.Outcome.AMBIGUOUS
-        return replace(
-            _with_symmetry(answer, self._belief.model.views, int(self._objects[0])),
-            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
-            outcome=outcome,
-            possible=tuple(self.names[j] for j in self._objects[:possible].tolist()),
-            confidence=float(self._probability[0]) if outcome is hbr.Outcome.FOUND else None,
-            min_confidence=CONFIDENT,
-            min_score=self._min_score,
-        )
+        count = 1 + int((np.cumsum(self._probability) < CONFIDENT).sum())
+        possible = [self.names[j] for j in self._objects[:count].tolist()]
+        answer = self._by_score(answer, possible, int(self._objects[0]), min_confidence=CONFIDENT)
+        found = answer.outcome is hbr.Outcome.FOUND
+        return replace(answer, confidence=float(self._probability[0]) if found else None)
 
 
 class DenseSearch(Search):

@@ -41,8 +41,6 @@ State = TypeVar("State", contravariant=True)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _AnyState:
-    """What the state of each search has."""
-
     table_deg: float
     config: IdentifyConfig
     rng: np.random.Generator
