@@ -129,16 +129,15 @@ class EnrollmentViews:
             self.retakes += attempt.number - 1
             self._require_object(attempt.image_bgr, azimuth_deg)
             segmented = self.segment(attempt.image_bgr, azimuth_deg)
-            yield from self._store(
-                index,
-                attempt,
-                segmented,
+            view = View(
+                index=index,
                 commanded_deg=move.commanded_deg,
                 encoder_deg=move.encoder_deg,
-                table_deg=table_deg,
+                azimuth_deg=azimuth_deg,
                 imu_deg=imu_deg,
                 imu_sigma_deg=imu_sigma_deg,
             )
+            yield from self._store(view, attempt, segmented)
             last = _SeenView(index, angle_deg, attempt.image_bgr)
             self._first = self._first or last
         return last
@@ -207,40 +206,20 @@ class EnrollmentViews:
             attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
             assert attempt.evidence.motion is not None
             measured_deg = attempt.evidence.motion.angle_deg
-            yield from self._store(
-                index, attempt, segmented, commanded_deg=angle_deg, encoder_deg=measured_deg, table_deg=measured_deg
-            )
+            azimuth_deg = self._azimuth_deg(measured_deg)
+            view = View(index=index, commanded_deg=angle_deg, encoder_deg=measured_deg, azimuth_deg=azimuth_deg)
+            yield from self._store(view, attempt, segmented)
             stored.add(index)
         self._require_not_moved(self._first, after)
         return stored
 
-    def _store(
-        self,
-        index: int,
-        attempt: Attempt,
-        segmented: DescribedView,
-        *,
-        commanded_deg: float,
-        encoder_deg: float,
-        table_deg: float,
-        imu_deg: float | None = None,
-        imu_sigma_deg: float | None = None,
-    ) -> Generator[Event, None, None]:
-        """Store an accepted view; ``table_deg`` is the best measurement of its table angle."""
-        view = View(
-            index=index,
-            commanded_deg=commanded_deg,
-            encoder_deg=encoder_deg,
-            azimuth_deg=self._azimuth_deg(table_deg),
-            captured_ns=attempt.evidence.exposed_ns,
-            imu_deg=imu_deg,
-            imu_sigma_deg=imu_sigma_deg,
-            evidence=plain(attempt.evidence),
-            region=self.bench.config.view.roi,
-        )
+    def _store(self, view: View, attempt: Attempt, segmented: DescribedView) -> Generator[Event, None, None]:
+        """Store an accepted view, which has its angles."""
+        view.captured_ns, view.evidence = attempt.evidence.exposed_ns, plain(attempt.evidence)
+        view.region = self.bench.config.view.roi
         self.enrollment.add(view, attempt.image_bgr, attempt.encoded)
-        yield accepted(index, view.azimuth_deg, attempt, segmented)
-        yield from warn_of_table(self.bench, index, segmented)
+        yield accepted(view.index, view.azimuth_deg, attempt, segmented)
+        yield from warn_of_table(self.bench, view.index, segmented)
 
     def _azimuth_deg(self, table_deg: float) -> float:
         return float(wrap360(self.bench.config.table.orientation_sign * table_deg))

@@ -29,7 +29,6 @@ from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import CatalogError, CatalogUnavailable, MotionStopped, NoObject, RigError, ViewRejected
-from rig.core.next_steps import steps_as_json
 from rig.devices.camera import CameraLocks, Frame
 from rig.events.events import (
     Accepted,
@@ -69,7 +68,6 @@ STAMPS: Final = 30
 MOST_FLIGHTS: Final = 8
 MOST_REJECTED: Final = 15  # half a second at 30 frames/s: what spoils so many does not pass by itself
 """Number of successive rejected frames after which the table stops and the next view is taken at rest."""
-_SAID: Final = ("what", "next_step", "steps")
 NEW_GOAL_DEG: Final = 10.0  # smaller: the table changes its speed for goals that show nearly the same side
 
 
@@ -148,8 +146,7 @@ class ViewsAtRest:
         known = self._missing
         event = answered(self.search.verify(self.describe.hypotheses), self._enrolled)
         if known is None and self._missing is not None:
-            values = {key: value for key, value in self._missing.as_dict().items() if key in _SAID}
-            yield Warned(None, Note(NoteCode.NOT_COMPARED, values))
+            yield Warned(None, _note(NoteCode.NOT_COMPARED, self._missing))
         if event is not None:
             yield event
 
@@ -495,10 +492,9 @@ class ResultRecorder:
                 with open_for_enrollment(CatalogPlace.of(self.place), self.clock) as journal:
                     return Recorded(record(journal, new, self._image), self.sample)
         except RigError as error:
-            return Warned(
-                None,
-                Note(
-                    NoteCode.NOT_RECORDED,
-                    {"what": error.what, "next_step": error.next_step, "steps": steps_as_json(error.steps)},
-                ),
-            )
+            return Warned(None, _note(NoteCode.NOT_RECORDED, error))
+
+
+def _note(code: NoteCode, error: RigError) -> Note:
+    values = error.as_dict()
+    return Note(code, {key: values[key] for key in ("what", "next_step", "steps")})
