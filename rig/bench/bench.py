@@ -193,7 +193,6 @@ class Bench(AbstractContextManager["Bench"]):
         return self._identities()
 
     def _identities(self) -> dict[str, Any]:
-        """Return the identities of the open devices."""
         devices = {"servo": self.servo, "imu": self._imu, "camera": self._camera}
         return {part: asdict(device.identity) for part, device in devices.items() if device is not None}
 
@@ -288,22 +287,17 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
     bench._as_opened = bench._as_opened or (bench.config, bench.findings)
     config, findings = bench._as_opened
     calibrations = store.on_bench(bench.apparatus(), bench.clock.utc())
-    in_force = [calibration.result for calibration in calibrations if calibration.status is CalibrationStatus.IN_FORCE]
+    in_force = [one.result for one in calibrations if one.status is CalibrationStatus.IN_FORCE]
+    others = [one for one in calibrations if one.status is not CalibrationStatus.IN_FORCE]
     bench.config, notes = apply_results(config, in_force)
     bench.safety.angle_reference.calibrate(bench.config.table)
     bench.conditions = {**bench.conditions, CALIBRATIONS: [result.id for result in in_force]}
     bench.calibration_findings = (
         *notes,
         *(error.what for error in store.unreadable),
-        *(
-            str(calibration).removesuffix(".")
-            for calibration in calibrations
-            if calibration.status is not CalibrationStatus.IN_FORCE
-        ),
+        *(str(one).removesuffix(".") for one in others),
     )
-    bench.calibration_steps = tuple(
-        calibration.repetition for calibration in calibrations if calibration.status is not CalibrationStatus.IN_FORCE
-    )
+    bench.calibration_steps = tuple(one.repetition for one in others)
     bench.findings = (*findings, *bench.calibration_findings)
 
 

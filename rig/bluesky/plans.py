@@ -58,8 +58,6 @@ def _run(devices: BenchDevices, steps: Steps, start: dict[str, Any]) -> Plan:
 
 
 class _Answer(Device):
-    """The answer of an identification as a reading."""
-
     def __init__(self, devices: BenchDevices, answer: Identified) -> None:
         super().__init__(devices, "answer")
         rotation = float("nan") if answer.yaw_deg is None else float(answer.yaw_deg)

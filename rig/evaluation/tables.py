@@ -98,14 +98,13 @@ def _poses(results: Mapping[str, Any]) -> Rows:
 def _stated(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
     """Return what right answers state about the pose, by the name of the row (`hbr.evaluation.poses.pose_rates`)."""
     heads = "pose of right answers|one, %|several, %|error°|towards a view°|within σ, %|within 2 σ, %|one, 30° off, %"
-    shown = {"one": 100, "several": 100, "error_median_deg": 1, "toward_view_median_deg": 1}
-    shown |= {"within_1_sigma": 100, "within_2_sigma": 100, "far": 100}
+    scales = {"pose_one": 100, "pose_several": 100, "pose_error_median_deg": 1, "pose_toward_view_median_deg": 1}
+    scales |= {"pose_within_1_sigma": 100, "pose_within_2_sigma": 100, "pose_far": 100}
+    return Rows(heads.split("|"), [[name, *_cells(own, scales)] for name, own in rates.items()])
 
-    def cells(own: Mapping[str, Any]) -> list[str]:
-        values = [(own[f"pose_{key}"], scale) for key, scale in shown.items()]
-        return ["–" if value is None else f"{scale * value:.1f}" for value, scale in values]
 
-    return Rows(heads.split("|"), [[name, *cells(own)] for name, own in rates.items()])
+def _cells(own: Mapping[str, Any], scales: Mapping[str, int]) -> list[str]:
+    return ["–" if own[key] is None else f"{scale * own[key]:.1f}" for key, scale in scales.items()]
 
 
 def _changes(rows: Sequence[Row]) -> Rows:
@@ -155,11 +154,10 @@ def _probabilities(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
     """Return the stated probabilities beside the shares that they promise, in percent, by the name of the row."""
     heads = "stated probability, mean %|named objects|stated|right|not enrolled: enrolled|left out"
     keys = ("accepted_stated", "accepted_right", "enrolled_not_enrolled", "left_out_not_enrolled")
-
-    def cells(own: Mapping[str, Any]) -> list[str]:
-        return ["–" if own[key] is None else _percent(own[key]) for key in keys]
-
-    return Rows(heads.split("|"), [[name, f"{own['accepted_searches']}", *cells(own)] for name, own in rates.items()])
+    rows = [
+        [name, f"{own['accepted_searches']}", *_cells(own, dict.fromkeys(keys, 100))] for name, own in rates.items()
+    ]
+    return Rows(heads.split("|"), rows)
 
 
 def cost_sentence(results: Mapping[str, Any]) -> str | None:

@@ -175,7 +175,6 @@ def _leader(one: Candidate) -> str:
 
 
 def _frame_words(used: FrameUsed) -> str:
-    """Return the state of a search in motion after a frame, in words."""
     best = f"{used.name} {percent_words(used.probability)}{_ENOUGH[used.outcome]}"
     where = f"azimuth {azimuth_words(used.azimuth_deg)}°, {used.seconds:.1f} s"
     rejected = f" ({counted(used.rejected, 'frame')} rejected)" if used.rejected else ""
@@ -194,7 +193,6 @@ def decision_words(decided: Decided) -> str:
 
 
 def _rotation_words(decided: Decided) -> str:
-    """Return why a rotation was chosen."""
     match decided.reason:
         case RotationReason.LESS_SIMILAR_SIDE if decided.s_left is not None and decided.s_right is not None:
             return _side_words(decided.side, decided.s_left, decided.s_right, len(decided.candidates))

@@ -93,8 +93,8 @@ class Turntable(AbstractContextManager["Turntable"]):
     position. Leaving always switches the torque off.
 
     With ``trust_gyro`` a motion is stopped if the gyro contradicts the encoder; calibrations of the gyro do without it.
-    The gyro is averaged over ``first_rest_s`` for its first bias. ``changes`` are settings of the section ``table``, for
-    calibrations, that differ from those of the bench. ``moves`` are the traces of the last moves.
+    For its first bias, the gyro is averaged over ``first_rest_s``. Calibrations give ``changes``: settings of the
+    section ``table`` that differ from those of the bench. ``moves`` are the traces of the last moves.
     """
 
     def __init__(
@@ -395,7 +395,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         rotation.due.extend((begun_ns + round(after_s * 1e9), lambda: None) for after_s in times_s)
 
     def _pause(self, rotation: _Rotation | None) -> None:
-        """Wait for the next round of the control loop."""
         config, clock = self._config, self._clock
         if rotation is not None and rotation.due:
             at_ns, act = rotation.due[0]
@@ -431,7 +430,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._backlash_taken_up = True
 
     def _end(self, rotation: _Rotation, commanded_deg: float) -> Move:
-        """Return the finished rotation, as encoder and gyro measured it."""
         gyro = self._gyro.end()
         rotation_deg = self._rest_deg - rotation.start_deg
         agreement = None
@@ -529,7 +527,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         return state, angle_deg
 
     def _check(self, state: ServoState, angle_deg: float, rotation: _Rotation | None) -> None:
-        """Check the servo, and the rotation if there is one."""
         if rotation is None or rotation.monitor is None:
             self._safety.check_servo(state)
         else:

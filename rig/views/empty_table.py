@@ -37,7 +37,6 @@ _VERSION: Final = 1
 
 
 def _problem(values: object) -> TableProblem | None:
-    """Return the problem of its JSON values."""
     if values is None or isinstance(values, TableProblem):
         return values
     if not isinstance(values, dict):
