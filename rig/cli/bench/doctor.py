@@ -183,14 +183,12 @@ def print_finding(screen: "Console", finding: "Finding") -> None:
     """Print a finding: its mark, its topic, its text, and below it the fix."""
     from rich.text import Text
 
-    from rig.doctor.finding import MARKS, Severity, finding_words
+    from rig.doctor.finding import Severity, finding_words
 
-    style = {Severity.FINE: "green", Severity.WARNING: "yellow", Severity.BAD: "bold red"}[finding.level]
+    marks = {Severity.FINE: ("✓", "green"), Severity.WARNING: ("!", "yellow"), Severity.BAD: ("✗", "bold red")}
     width = max(screen.width - _INDENT, 24) if screen.is_terminal else 10_000
     first, *more = wrap(finding_words(finding), width, break_on_hyphens=False) or [""]
-    screen.print(
-        Text.assemble((MARKS[finding.level], style), f" {finding.topic:{_TOPIC_WIDTH}s}{first}"), soft_wrap=True
-    )
+    screen.print(Text.assemble(marks[finding.level], f" {finding.topic:{_TOPIC_WIDTH}s}{first}"), soft_wrap=True)
     for line in more:
         screen.print(Text(" " * _INDENT + line), soft_wrap=True)
     if finding.fix:
