@@ -100,7 +100,7 @@ def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) 
         calibration.status is CalibrationStatus.IN_FORCE,
         str(calibration.status),
         str(calibration),
-        calibration.repetition.command,
+        calibration.repetition.command or "",
         [f"Rejected on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {rejection}" for rejection in latest.rejections],
         # Trusted markup: the SVG escapes its texts.
         [Markup(figure.svg()) for figure in plots(result)],

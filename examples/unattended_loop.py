@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 from rig import Catalog, identify, load_model, open_bench, photograph_table
@@ -38,7 +39,7 @@ def main() -> int:
                 if answers == arguments.answers:
                     break
     except RigError as error:
-        print(json.dumps(error.as_dict(), default=str), flush=True)
+        print(json.dumps(asdict(error.problem)), flush=True)
         return error.exit_code
     return 0
 

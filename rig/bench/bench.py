@@ -109,7 +109,7 @@ class Bench(AbstractContextManager["Bench"]):
         self.safety.fault_observers.append(self._notify_fault)
 
     def _notify_fault(self, error: RigError) -> None:
-        message = {"event": "fault", "bench": self.name, "text": f"{self.name}: {error.what}", "fault": error.as_dict()}
+        message = {"event": "fault", "bench": self.name, "text": f"{self.name}: {error.what}", "fault": error.problem}
         notify(self.config.notify_command, message)
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:

@@ -90,7 +90,7 @@ def _usage_error(*, json: bool) -> Iterator[None]:
         if json and type(error).__name__ != "NoArgsIsHelpError":
             path = error.ctx.command_path if error.ctx else "rig"
             problem = UsageError(error.format_message(), next_step=f"For the arguments: {path} --help")
-            Settings().print_json(problem.as_dict())
+            Settings().print_json(problem.problem)
         raise
 
 

@@ -6,12 +6,41 @@ The hundreds of a code are the exit code of the command line: 2 usage, 3 configu
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Final
 
+from rig.core.json_form import plain
 from rig.core.masking import masked
-from rig.core.next_steps import Do, NextSteps, SomeSteps, as_steps, in_words, steps_as_json
+from rig.core.next_steps import Do, NextSteps, SomeSteps, as_steps, in_words
 
 Evidence = Mapping[str, Any]
+ERRORS: Final = "/reference/errors.html"
+"""The page of all errors, with an anchor for each code: in the documentation, and of each server without a network."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """An error (RFC 9457), the same in ``--json``, in events, in the REST API and in all that is stored."""
+
+    # This and the text of the next step follow from the rest, also when a problem is read.
+    type: str = ""
+    """Address of its description, on each server and in the documentation."""
+    title: str
+    """Kind of the error."""
+    code: int
+    """Number of the kind; its hundreds are the exit code of a command."""
+    detail: str
+    """What happened, in a sentence."""
+    evidence: dict[str, Any] = field(default_factory=dict)
+    """Measurements and names that show the error."""
+    next_step: str = ""
+    """What the operator should do, as a terminal shows it."""
+    steps: NextSteps
+    """The same as data, in order: sentences for what only hands can do, and actions of the rig."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "type", f"{ERRORS}#{self.code}")
+        object.__setattr__(self, "next_step", in_words(self.steps))
 
 
 class RigError(Exception):
@@ -49,16 +78,11 @@ class RigError(Exception):
     def exit_code(self) -> int:
         return self.code // 100
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the error as `--json` prints it."""
-        return {
-            "error": self.title,
-            "code": self.code,
-            "what": self.what,
-            "evidence": self.evidence,
-            "next_step": self.next_step,
-            "steps": steps_as_json(self.steps),
-        }
+    @property
+    def problem(self) -> Problem:
+        """The error as data."""
+        evidence = plain(self.evidence)
+        return Problem(title=self.title, code=self.code, detail=self.what, evidence=evidence, steps=self.steps)
 
 
 def error_kinds() -> list[type[RigError]]:
@@ -67,6 +91,12 @@ def error_kinds() -> list[type[RigError]]:
     for kind in found:  # grows while it is read
         found += [sub for sub in kind.__subclasses__() if sub.__module__ == RigError.__module__]
     return sorted(set(found), key=lambda kind: kind.code)
+
+
+def error_of(problem: Problem) -> RigError:
+    """Return the error of which ``problem`` is the data."""
+    kind = next((one for one in error_kinds() if one.code == problem.code), RigError)
+    return kind(problem.detail, next_step=problem.steps, evidence=problem.evidence)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ Decision: docs/decisions/0002.
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum, unique
 from shlex import quote
 from typing import Any, Final, Self
@@ -111,21 +111,26 @@ class NextStep:
     """An action that the operator does next."""
 
     action: Do
+    """What to do."""
     parameters: dict[str, Any] = field(default_factory=dict)
-    """Its parameters. Passwords in them are `masked`."""
-    options: tuple[str, ...] = field(default=(), compare=False)
-    """Options of the command line that select the bench and its configuration: ``--bench sim``."""
+    """Its parameters. Passwords in them are masked."""
+    # Made from the action also when a step is read: a stored command is not believed.
+    command: str | None = field(default=None, compare=False)
+    """The command line; an unknown parameter is in capitals. Null if no command does the action."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", masked(self.parameters))
-
-    @property
-    def command(self) -> str:
-        """The command line; an unknown parameter is in capitals. Empty if no command does the action."""
         words = _KEY.sub(lambda key: quote(str(self.parameters.get(key[1], key[1].upper()))), self.action.command)
-        if not words.startswith("rig "):
-            return words
-        return " ".join([words, *self._given_options(), *map(quote, self.options)])
+        if words.startswith("rig "):
+            words = " ".join([words, *self._given_options()])
+        object.__setattr__(self, "command", words or None)
+
+    def with_options(self, options: Iterable[str]) -> Self:
+        """Return the step with options that select the bench and its configuration: ``--bench sim``."""
+        step = replace(self)
+        if step.command is not None and step.command.startswith("rig "):
+            object.__setattr__(step, "command", " ".join([step.command, *map(quote, options)]))
+        return step
 
     @property
     def words(self) -> str:
@@ -138,10 +143,6 @@ class NextStep:
     def text(self) -> str:
         """The action in words, without a command."""
         return _KEY.sub(lambda key: str(self.parameters.get(key[1], key[1].upper())), self.action.words)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the step as `--json` prints it."""
-        return {"action": str(self.action), "parameters": self.parameters, "command": self.command or None}
 
     def _given_options(self) -> Iterator[str]:
         """Yield the words of the parameters that are options of the command."""
@@ -182,13 +183,8 @@ def in_words(steps: SomeSteps) -> str:
     return words
 
 
-def steps_as_json(steps: Iterable[str | NextStep]) -> list[Any]:
-    """Return a next step as `--json` prints it: a sentence is a text, an action an object."""
-    return [step if isinstance(step, str) else step.as_dict() for step in steps]
-
-
 def steps_from_json(values: Any) -> NextSteps:
-    """Return the next step of values from `steps_as_json`; what is not one is left out: a saved run may be damaged."""
+    """Return the next step of its JSON values; what is not one is left out: a saved run may be damaged."""
     steps: list[str | NextStep] = []
     for value in values if isinstance(values, list | tuple) else ():
         match value:

@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.camera_node import camera_node
+from rig.core.json_form import plain
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.dynamixel.port import GUARDIAN
 from rig.doctor.context import DoctorContext
@@ -39,10 +40,10 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
         yield FindingCode.BENCH_IN_USE(holder=who, pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
-        what = state.fault.what if state.fault else state.damage
+        what = state.fault.detail if state.fault else state.damage
         yield FindingCode.STATE_DAMAGED(what=what, damage=state.damage)
     elif state.fault is not None:
-        yield FindingCode.FAULT_LATCHED(**state.fault.as_dict())
+        yield FindingCode.FAULT_LATCHED(**plain(state.fault))
     if context.holder is None and not state.damage and state.fault is None:
         yield FindingCode.BENCH_FREE(bench=context.bench, state=path)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ class DoctorContext:
 
     def step(self, step: NextStep) -> NextStep:
         """Return a step whose command is for this bench."""
-        return replace(step, options=self.file_options if step.action is Do.SET_KEY else self.options)
+        return step.with_options(self.file_options if step.action is Do.SET_KEY else self.options)
 
     @property
     def catalog_path(self) -> Path:

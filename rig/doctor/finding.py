@@ -7,8 +7,9 @@ from functools import partial
 from typing import Any
 
 from rig.core.errors import RigError
+from rig.core.json_form import plain
 from rig.core.masking import masked
-from rig.core.next_steps import Do, NextStep, NextSteps, SomeSteps, as_steps, in_words, steps_as_json
+from rig.core.next_steps import Do, NextStep, NextSteps, SomeSteps, as_steps, in_words
 from rig.core.phrases import filled
 from rig.devices.i2c import RESTART_CONTROLLER
 
@@ -65,7 +66,7 @@ class FindingCode(Enum):
         *("Check how far the cable is wound up, then", Do.ACKNOWLEDGE(), "If it hangs free,"),
         *(Do.SET_REVOLUTIONS(revolutions=0), "Otherwise, give the revolutions that it is wound up."),
     )
-    FAULT_LATCHED = _bad("fault {code} ({title}) is latched since {utc}: {what}", Do.ACKNOWLEDGE())
+    FAULT_LATCHED = _bad("fault {code} ({title}) is latched since {utc}: {detail}", Do.ACKNOWLEDGE())
     # ports
     NO_SERIAL_PORT = _bad("there is no serial port {wanted} (found: {found})")
     NO_I2C_BUS = _bad("there is no I2C bus {wanted} (found: {found})")
@@ -317,8 +318,8 @@ class Finding:
             "code": self.code.name.lower(),
             "finding": finding_words(self),
             "fix": self.fix or None,
-            "steps": steps_as_json(self.steps),
-            "evidence": {key: _plain(value) for key, value in self.parameters.items()},
+            "steps": plain(self.steps),
+            "evidence": _as_json(self.parameters),
         }
 
 
@@ -344,10 +345,10 @@ def _listed(value: Any) -> Any:
     return ", ".join(map(str, value)) or "none" if isinstance(value, list | tuple) else "?" if value is None else value
 
 
-def _plain(value: Any) -> Any:
+def _as_json(value: Any) -> Any:
     """Return a value as JSON can have it; devices and dates as text."""
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return [_as_json(item) for item in value]
+    if isinstance(value, Mapping):
+        return {key: _as_json(item) for key, item in value.items()}
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)

@@ -19,6 +19,7 @@ from pydantic_core import core_schema, from_json, to_json
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.model.symmetry import SimilarObject
+from rig.core.errors import Problem
 from rig.core.phrases import Worded
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
@@ -53,8 +54,8 @@ class NoteCode(Worded):
         "table-differs",
         "the table does not look as it did at {taken_utc}; an object that is round may be on it",
     )
-    NOT_RECORDED = "not-recorded", "the answer is not recorded: {what}"
-    NOT_COMPARED = "not-compared", "the leading candidates are not compared pixel by pixel: {what}"
+    NOT_RECORDED = "not-recorded", "the answer is not recorded: {detail}"
+    NOT_COMPARED = "not-compared", "the leading candidates are not compared pixel by pixel: {detail}"
     LOCAL_COPY = "local-copy", "the server of the catalog cannot be used; this uses the copy of {copied_utc}"
 
 
@@ -484,18 +485,8 @@ class Failed:
     """
 
     event: Literal["failed"] = field(default="failed", init=False)
-    error: str
-    """Kind of the error."""
-    code: int
-    """Number of the error."""
-    what: str
-    """What happened."""
-    evidence: dict[str, Any]
-    """Measurements and names that show the error."""
-    next_step: str
-    """What the operator should do, as a terminal shows it."""
-    steps: list[str | dict[str, Any]]
-    """The same as data, in order: sentences, and actions (``action``, ``parameters``, ``command``)."""
+    error: Problem
+    """The error."""
 
 
 class LeftOutReason(StrEnum):

@@ -6,6 +6,7 @@ from typing import Final
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.model.symmetry import SimilarObject
+from rig.core.errors import Problem
 from rig.core.next_steps import Do, NextStep, NextSteps, in_words, steps_from_json
 from rig.core.phrases import (
     angle_range,
@@ -80,7 +81,7 @@ def next_steps(event: Event) -> NextSteps:
         case Warned():
             return note_steps(event.note)
         case Failed():
-            return steps_from_json(event.steps)
+            return event.error.steps
         case _:
             return ()
 
@@ -166,7 +167,12 @@ def page_line(event: Event) -> str:
         case Recorded():
             return f"Recorded as result {event.result}{f', sample {event.sample}' if event.sample else ''}."
         case Failed():
-            return f"Error {event.code} ({event.error}): {event.what}"
+            return problem_line(event.error)
+
+
+def problem_line(problem: Problem) -> str:
+    """Return an error in a line, without its next step."""
+    return f"Error {problem.code} ({problem.title}): {problem.detail}"
 
 
 def _leader(one: Candidate) -> str:

@@ -12,7 +12,7 @@ from urllib.request import Request, urlopen
 from rig.bench import Bench
 from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
 from rig.core.json_form import plain
-from rig.core.next_steps import Do, steps_as_json
+from rig.core.next_steps import Do, as_steps
 from rig.devices.camera import Camera
 from rig.devices.imu import Imu, open_imu
 from rig.doctor.camera import open_camera
@@ -47,7 +47,7 @@ def _report_of(bench: Bench) -> dict[str, Any]:
     report: dict[str, Any] = {
         "bench": bench.name,
         "state": str(safety.state),
-        "fault": safety.fault.as_dict() if safety.fault else None,
+        "fault": safety.fault,
         "doubt": str(safety.doubt) if safety.doubt else None,
         "table_deg": None if safety.doubt else safety.angle_reference.to_table(state.position_deg),
         "limits_deg": list(bench.config.table.limits_deg),
@@ -56,8 +56,9 @@ def _report_of(bench: Bench) -> dict[str, Any]:
         **({"head": bench.head.report()} if bench.head else {}),
         "camera": _read(lambda: _camera_values(bench.camera)),
     }
-    steps = steps_as_json(safety.next_step or bench.calibration_steps)
-    return {**report, "findings": list(bench.findings), "steps": steps}  # opening the camera adds some findings
+    steps = safety.next_step or bench.calibration_steps
+    # Opening the camera adds some findings.
+    return dict(plain({**report, "findings": list(bench.findings), "steps": as_steps(steps)}))
 
 
 def _report_without_servo(context: DoctorContext, missing: RigError) -> dict[str, Any]:
@@ -73,7 +74,7 @@ def _report_without_servo(context: DoctorContext, missing: RigError) -> dict[str
 
     return {
         "bench": context.bench,
-        "servo": {"error": missing.as_dict()},
+        "servo": {"error": plain(missing.problem)},
         **({"imu": _read(imu)} if config.imu.connection == "i2c" else {}),
         "camera": _read(camera),
     }
@@ -111,4 +112,4 @@ def _read(values: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     try:
         return values()
     except RigError as error:
-        return {"error": error.as_dict()}
+        return {"error": plain(error.problem)}

@@ -8,6 +8,7 @@ from rig.bench import Bench
 from rig.catalog import Action
 from rig.config import MAX_LIMIT_DEG
 from rig.core.errors import RigError, Unreferenced, UsageError
+from rig.core.json_form import plain
 from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import angle_words, counted, signed
 from rig.jobs.desk import Desk, JobResult, Remark, Steps
@@ -186,9 +187,9 @@ def acknowledge(desk: Desk, *, reboot: bool = False) -> Steps[None]:
     with desk.open_bench(DEVICES) as bench:
         fault = bench.safety.fault
         state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
-    text = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
+    text = f"Acknowledged: {fault.detail}" if fault else "No fault was latched."
     values = {
-        "acknowledged": fault.as_dict() if fault else None,
+        "acknowledged": plain(fault),
         "state": str(state),
         "doubt": str(doubt) if doubt else None,
     }

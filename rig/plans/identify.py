@@ -29,6 +29,7 @@ from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import CatalogError, CatalogUnavailable, MotionStopped, NoObject, RigError, ViewRejected
+from rig.core.json_form import plain
 from rig.devices.camera import CameraLocks, Frame
 from rig.events.events import (
     Accepted,
@@ -146,7 +147,7 @@ class ViewsAtRest:
         known = self._missing
         event = answered(self.search.verify(self.describe.hypotheses), self._enrolled)
         if known is None and self._missing is not None:
-            yield Warned(None, _note(NoteCode.NOT_COMPARED, self._missing))
+            yield Warned(None, Note(NoteCode.NOT_COMPARED, plain(self._missing.problem)))
         if event is not None:
             yield event
 
@@ -420,7 +421,7 @@ def watch(
             answer = yield from identify_next()
             views = answer.views + len(answer.left_out)
         except (NoObject, ViewRejected) as error:
-            yield Failed(**error.as_dict())
+            yield Failed(error.problem)
             views = 0
         with Turntable(bench) as table:
             if abs(table.rest_deg - home_deg) > bench.config.table.tolerance_deg:
@@ -492,9 +493,4 @@ class ResultRecorder:
                 with open_for_enrollment(CatalogPlace.of(self.place), self.clock) as journal:
                     return Recorded(record(journal, new, self._image), self.sample)
         except RigError as error:
-            return Warned(None, _note(NoteCode.NOT_RECORDED, error))
-
-
-def _note(code: NoteCode, error: RigError) -> Note:
-    values = error.as_dict()
-    return Note(code, {key: values[key] for key in ("what", "next_step", "steps")})
+            return Warned(None, Note(NoteCode.NOT_RECORDED, plain(error.problem)))

@@ -10,15 +10,15 @@ time t is
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import hypot, inf, isfinite, sqrt
-from typing import Literal
+from math import hypot, inf, isfinite, nan, sqrt
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidatorFunctionWrapHandler, WithJsonSchema, WrapValidator
 
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
-from rig.core.json_form import NumberOrNull
 from rig.core.phrases import Worded, filled, signed
 from rig.devices.imu import Imu
 
@@ -91,6 +91,14 @@ class Agreement:
     @property
     def agrees(self) -> bool:
         return abs(self.difference_deg) <= self.bound_deg
+
+
+def _read(value: Any, read: ValidatorFunctionWrapHandler) -> Any:
+    return nan if value is None else read(value)
+
+
+NumberOrNull = Annotated[float, WrapValidator(_read), WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "null"}]})]
+"""A number that may be infinite or nan: it is null in JSON, and null is read as nan."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,23 +8,23 @@ Decision: docs/decisions/0004.
 import errno
 import fcntl
 import hashlib
-import json
 import os
 import signal
 import sys
 from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, TextIO
+from typing import Any, ClassVar, Final, TextIO
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from rig.core import files
 from rig.core.clock import Clock
-from rig.core.errors import BenchBusy, MotionStopped, RigError, StateNotStored, os_errors_as
+from rig.core.errors import BenchBusy, MotionStopped, Problem, RigError, StateNotStored, os_errors_as
 from rig.core.files import no_follow
 from rig.core.masking import masked
-from rig.core.next_steps import Do, NextSteps, in_words, steps_as_json
+from rig.core.next_steps import Do
 from rig.safety.stop_channel import StopAnswer, StopListener, StopRequest, listen
 
 VERSION = 1  # a state of another version counts as damaged, because it may have contained a fault
@@ -59,25 +59,28 @@ class SavedTable(_Saved):
     gear_ratio: float
 
 
-class LatchedFault(_Saved):
-    """A latched fault: the error and its time."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LatchedFault(Problem):
+    """A latched fault, which must be acknowledged before the table moves again: an error, and its time.
 
-    code: int
-    title: str
-    what: str
-    steps: NextSteps
-    evidence: dict[str, Any] = {}
+    Attributes
+    ----------
+    utc
+        When it was latched.
+    """
+
     utc: str
 
     @classmethod
     def of(cls, error: RigError, utc: str) -> "LatchedFault":
         """Return ``error`` as a fault that can be stored."""
-        evidence = json.loads(json.dumps(error.evidence, default=str))
-        return cls(code=error.code, title=error.title, what=error.what, steps=error.steps, evidence=evidence, utc=utc)
+        one = error.problem
+        return cls(title=one.title, code=one.code, detail=one.detail, evidence=one.evidence, steps=one.steps, utc=utc)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fault as `--json` prints it."""
-        return {**self.model_dump(), "next_step": in_words(self.steps), "steps": steps_as_json(self.steps)}
+
+_FAULT: Final = TypeAdapter(LatchedFault)
+_DERIVED: Final[dict[str, Any]] = {"type": True, "next_step": True, "steps": {"__all__": {"command"}}}
+"""Fields of a fault that are not stored: another version of the program may word them differently."""
 
 
 class BenchState(_Saved):
@@ -93,7 +96,7 @@ class BenchState(_Saved):
     damage: str = ""
 
     def with_checksum(self) -> "BenchState":
-        values = self.model_dump_json(exclude={"checksum", "damage"})
+        values = self.model_dump_json(exclude={"checksum": True, "damage": True, "fault": _DERIVED})
         return self.model_copy(update={"checksum": hashlib.sha256(values.encode()).hexdigest()})
 
 
@@ -255,7 +258,7 @@ class FileStore:
             if len(text) != LATCH_BYTES:
                 damage = damage or f"{self._latch} is damaged: it has {len(text)} bytes"
             if text.strip():
-                fault = LatchedFault.model_validate_json(text)
+                fault = _FAULT.validate_json(text)
         except FileNotFoundError:
             damage = damage or f"{self._latch} is missing"
         except OSError as error:
@@ -272,11 +275,12 @@ class FileStore:
             self._write_latch(fault)
 
     def _write_latch(self, fault: LatchedFault | None) -> None:
-        text = b"" if fault is None else fault.model_dump_json().encode()
+        text = b"" if fault is None else _FAULT.dump_json(fault, exclude=_DERIVED)
         if fault is not None and len(text) >= LATCH_BYTES:
             steps = tuple(step[:500] if isinstance(step, str) else step for step in fault.steps)
-            short = fault.model_copy(update={"what": fault.what[:500], "steps": steps})
-            text = short.model_copy(update={"evidence": {}}).model_dump_json().encode()
+            text = _FAULT.dump_json(
+                replace(fault, detail=fault.detail[:500], steps=steps, evidence={}), exclude=_DERIVED
+            )
         content = text.ljust(LATCH_BYTES - 1) + b"\n"
         if not self._latch_is_reserved():
             files.write(self._latch, content)
@@ -296,7 +300,7 @@ class FileStore:
             make_folder(self.path)
             if not self._latch_is_reserved():
                 self._write_latch(state.fault)
-            stored = state.with_checksum().model_dump_json(indent=1, exclude={"damage"})
+            stored = state.with_checksum().model_dump_json(indent=1, exclude={"damage": True, "fault": _DERIVED})
             files.write(self._file, stored.encode())
             if not self._used.exists():
                 files.write(
@@ -383,7 +387,7 @@ def _fault_of_damage(damage: str) -> LatchedFault:
     return LatchedFault(
         code=StateNotStored.code,
         title=StateNotStored.title,
-        what=f"The bench's stored state is lost, and a fault may be lost with it: {damage}.",
+        detail=f"The bench's stored state is lost, and a fault may be lost with it: {damage}.",
         steps=("Look at the table and its cable.", Do.ACKNOWLEDGE()),
         utc="an unknown time",
     )

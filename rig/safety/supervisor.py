@@ -436,7 +436,7 @@ class Safety:
         if self.fault is not None:
             fault = self.fault
             return FaultLatched(
-                f"A fault is latched since {fault.utc}: {fault.what}",
+                f"A fault is latched since {fault.utc}: {fault.detail}",
                 next_step=fault.steps,
                 evidence={"code": fault.code, **fault.evidence},
             )

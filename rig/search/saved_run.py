@@ -19,6 +19,7 @@ from typing import Any, Final, Self, TextIO
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 import hbr
 from hbr.core.arrays import MIN_SIDE_PX
@@ -26,8 +27,9 @@ from hbr.descriptors import Descriptor, descriptor
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.config.values import validate
-from rig.core.errors import CatalogError, RigError, UsageError, os_errors_as
+from rig.core.errors import CatalogError, Problem, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
+from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import short
 from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
@@ -45,6 +47,7 @@ _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.j
 """Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
 _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
 """Exceptions because of values of a wrong type."""
+_PROBLEM: Final = TypeAdapter(Problem)
 
 
 class RunWriter:
@@ -84,7 +87,7 @@ class RunWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, RigError):
-            self._line(error.as_dict())
+            self._line(plain(error.problem))
         self._events.close()
 
     def add(self, event: Event) -> None:
@@ -137,8 +140,8 @@ class SavedRun:
     model: Model
     empty_table: NDArray[np.uint8] | None
     """The sheet of empty-table images, uint8 (H, W, 3) (`rig.views.table_sheet`)."""
-    error: dict[str, Any] | None
-    """The error that ended the search, as in `RigError.as_dict`."""
+    error: Problem | None
+    """The error that ended the search."""
     is_cut: bool
     """Whether the last line of the events was cut off while it was written."""
     _lines: tuple[dict[str, Any], ...]
@@ -220,9 +223,10 @@ def load_run(folder: Path) -> SavedRun:
         content = _bytes(folder, "events.jsonl")
         is_cut = bool(content) and not content.endswith(b"\n")
         lines = [_object(line) for line in _lines(content)[: -1 if is_cut else None]]
-        failed = lines.pop() if lines and "event" not in lines[-1] else None
-        if failed is not None and not {"code", "error", "what"} <= failed.keys():
-            raise ValueError("the last line of events.jsonl is neither an event nor an error")
+        has_failed = bool(lines) and "event" not in lines[-1]
+        failed = _PROBLEM.validate_python(lines.pop()) if has_failed else None
+    except ValidationError as error:
+        raise _damaged(folder, "the last line of events.jsonl is neither an event nor an error") from error
     except CatalogError as error:
         raise _damaged(folder, f"{error.what.rstrip('.')}: {error.evidence['reason']}") from error
     except _DAMAGE as error:

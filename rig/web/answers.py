@@ -10,13 +10,15 @@ from pydantic import BaseModel, ConfigDict, Discriminator, GetJsonSchemaHandler,
 from pydantic_core import CoreSchema
 
 from rig.catalog.facts import Action
-from rig.catalog.records import EnrollmentStatus, RecordedOutcome
+from rig.catalog.records import EnrollmentStatus, Provenance, RecordedOutcome
 from rig.catalog.results import ResultRow
+from rig.core.errors import Problem
+from rig.core.next_steps import NextSteps
 from rig.devices.camera import CameraIdentity
-from rig.events.events import DESCRIBED, Event, JsonEvent
+from rig.events.events import DESCRIBED, Event, JsonEvent, SimilarObjects
+from rig.safety.saved_state import LatchedFault
 from rig.safety.supervisor import TableState
 from rig.web.access import Role
-from rig.web.problems import Problem
 
 Row = TypeVar("Row")
 
@@ -71,33 +73,6 @@ class Me(Login):
     lease: LeaseState
 
 
-Steps = list[str | dict[str, Any]]
-"""What to do next: a text for what only hands can do, an object for an action of the rig."""
-
-
-class ErrorBody(BaseModel):
-    """An error as ``rig --json`` prints it; ``error`` is its title."""
-
-    error: str
-    code: int
-    what: str
-    evidence: dict[str, Any]
-    next_step: str
-    steps: Steps
-
-
-class FaultBody(BaseModel):
-    """The latched fault, which must be acknowledged before the table moves again."""
-
-    title: str
-    code: int
-    what: str
-    evidence: dict[str, Any]
-    next_step: str
-    steps: Steps
-    utc: str
-
-
 class ServoReading(BaseModel):
     """The last reading of the servo."""
 
@@ -121,14 +96,14 @@ class BenchStatus(BaseModel):
 
     open: bool = False
     job: str | None = None
-    error: ErrorBody | None = None
+    error: Problem | None = None
     problem: Problem | None = None
     picture_age_s: float | None = None
     bench: str | None = None
     state: TableState | None = None
-    fault: FaultBody | None = None
+    fault: LatchedFault | None = None
     doubt: str | None = None
-    steps: Steps | None = None
+    steps: NextSteps | None = None
     limits_deg: tuple[float, float] | None = None
     findings: list[str] | None = None
     camera: CameraIdentity | None = None
@@ -241,7 +216,7 @@ class EnrollmentRow(BaseModel):
     finished_utc: Time | None
     planned_views: int
     stored_views: int
-    sessions: list[dict[str, Any]]
+    sessions: list[Provenance]
 
 
 class ViewRow(BaseModel):
@@ -261,7 +236,7 @@ class ObjectWithViews(ObjectRow):
 
     enrollments: list[EnrollmentRow]
     views_taken: list[ViewRow]
-    similar: dict[str, Any] | None
+    similar: SimilarObjects | None
 
 
 class CorrectionRow(BaseModel):

@@ -20,7 +20,6 @@ from rig.catalog.records import RecordedOutcome
 from rig.catalog.results import Result, ResultFilter, ResultRow, correct, find_result, find_results
 from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
-from rig.core.json_form import plain
 from rig.plans.enroll import similar_objects
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
 from rig.web.answers import (
@@ -84,7 +83,7 @@ def add_objects(routes: Routes, server: Server) -> None:
                 finished_utc=one.finished_utc,
                 planned_views=len(one.enrollment.planned_azimuth_deg),
                 stored_views=len(one.enrollment.views),
-                sessions=[plain(session.provenance) for session in one.enrollment.sessions],
+                sessions=[session.provenance for session in one.enrollment.sessions],
             )
             for one in found.enrollments
         ]
@@ -92,7 +91,7 @@ def add_objects(routes: Routes, server: Server) -> None:
             **_row(found.summary),
             enrollments=enrollments,
             views_taken=[ViewRow.model_validate(view) for view in found.views],
-            similar=plain(similar) if similar else None,
+            similar=similar,
         )
 
     @routes.operate.patch("/objects/{name:path}", tags=["catalog"])

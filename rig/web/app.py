@@ -13,13 +13,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 from starlette.exceptions import HTTPException
 
-from rig.core.errors import RigError
+from rig.core.errors import Problem, RigError, UsageError
 from rig.web.api_bench import add_access, add_bench, add_jobs, add_shelf
 from rig.web.api_catalog import add_bundles, add_objects, add_results
 from rig.web.api_pictures import add_pictures
 from rig.web.api_records import add_records
 from rig.web.pages import add_reference, pages
-from rig.web.problems import Problem, ProblemResponse
+from rig.web.problems import ProblemResponse
 from rig.web.requests import JobState
 from rig.web.server import API, Routes, Server, Watcher
 
@@ -70,18 +70,18 @@ def create_app(server: Server) -> FastAPI:
     # Every error has the same body: code, evidence and next step.
     @app.exception_handler(RigError)
     async def rig_error(_request: Request, error: RigError) -> Response:
-        return ProblemResponse.of(error)
+        return ProblemResponse(error)
 
     @app.exception_handler(RequestValidationError)
     async def not_valid(_request: Request, error: RequestValidationError) -> Response:
         mistakes = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
         what, step = "The request is not valid.", "Correct these values."
-        return ProblemResponse.of_request(422, what, step, evidence={"mistakes": mistakes})
+        return ProblemResponse(UsageError(what, next_step=step, evidence={"mistakes": mistakes}), 422)
 
     @app.exception_handler(HTTPException)
     async def http_error(_request: Request, error: HTTPException) -> Response:
-        step = f"See {API}/openapi.json."
-        return ProblemResponse.of_request(error.status_code, str(error.detail), step, error.headers)
+        found = UsageError(str(error.detail), next_step=f"See {API}/openapi.json.")
+        return ProblemResponse(found, error.status_code, error.headers)
 
     return app
 

@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
+from rig.core.errors import UsageError
 from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import whole
 from rig.web.problems import ProblemResponse
@@ -103,7 +104,8 @@ class Guard:
         if rejection is None:
             await self._app(scope, limited, guarded)
         else:
-            await ProblemResponse.of_request(*rejection)(scope, receive, guarded)
+            status, what, step = rejection
+            await ProblemResponse(UsageError(what, next_step=step), status)(scope, receive, guarded)
 
     def _rejection(self, method: str, path: str, headers: Headers) -> tuple[int, str, SomeSteps] | None:
         host = headers.get("host", "")

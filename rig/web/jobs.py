@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final
 
 from pydantic import ValidationError
-from pydantic_core import to_jsonable_python
 
 from rig.catalog.results import clean_text
 from rig.core.clock import Clock
@@ -227,7 +226,7 @@ class JobQueue:
     def end(self, job: Job, state: JobState, error: RigError | None = None) -> None:
         """End a job; an unfinished one gets the request that continues it."""
         with self._lock:
-            job.error = None if error is None else to_jsonable_python(error.as_dict(), fallback=str)
+            job.error = None if error is None else error.problem
             if state is not JobState.DONE:
                 self._offer_to_continue(job, error)
             self._end(state, job)

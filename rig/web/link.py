@@ -17,12 +17,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import TypeAdapter
 from pydantic_core import to_jsonable_python
 
-from rig.core import errors
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import BenchBusy, RigError
-from rig.core.next_steps import Do, steps_as_json, steps_from_json
+from rig.core.errors import BenchBusy, Problem, RigError, error_of
+from rig.core.next_steps import Do
 from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
 from rig.web.answers import BenchStatus
 
@@ -36,6 +36,7 @@ PICTURE_S: Final = 0.08
 CONFIRM_S: Final = 3.0
 """How long a request to stop is held until the bench has confirmed it; the page warns after one second."""
 
+_PROBLEM: Final = TypeAdapter(Problem)
 Functions = Mapping[str, Callable[..., Any]]
 """Functions that the other end may call: they take and return JSON values.
 
@@ -138,9 +139,7 @@ class Link:
         if future is None or future.done():  # the call has ended already
             return
         if "error" in message:
-            kind, what, steps, evidence = message["error"]
-            error = getattr(errors, kind, RigError)
-            future.set_exception(error(what, next_step=steps_from_json(steps), evidence=evidence))
+            future.set_exception(error_of(_PROBLEM.validate_python(message["error"])))
         else:
             future.set_result(message["result"])
 
@@ -149,7 +148,7 @@ class Link:
         try:
             return {"result": self._functions[message["call"]](**message["values"])}
         except RigError as error:
-            return {"error": [type(error).__name__, error.what, steps_as_json(error.steps), error.evidence]}
+            return {"error": error.problem}
 
 
 def _json_values(value: Any) -> Any:

@@ -16,10 +16,9 @@ from markupsafe import Markup
 from pydantic import BaseModel
 
 from rig.charts.compass import dial
-from rig.core.errors import error_kinds
+from rig.core.errors import ERRORS, error_kinds
 from rig.core.next_steps import Do
 from rig.core.templates import environment
-from rig.web.problems import ERRORS
 from rig.web.requests import AcknowledgeRequest, DoctorRequest, EmptyTableRequest, ReferenceRequest
 
 PAGES: Final = {

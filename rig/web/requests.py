@@ -5,6 +5,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from rig.core.errors import Problem
+from rig.core.next_steps import NextSteps
 from rig.plans.operator import Choice
 
 
@@ -151,7 +153,7 @@ class JobQuestion(_Request):
 
     text: str
     choices: tuple[Choice, ...]
-    steps: Annotated[list[str | dict[str, Any]], Field(description="what to do first, as the steps of an error")] = []
+    steps: Annotated[NextSteps, Field(description="what to do first, as the steps of an error")] = ()
     takes_sample: bool = False
 
 
@@ -205,7 +207,7 @@ class Job(BaseModel):
     question: JobQuestion | None = None
     result: dict[str, Any] | None = None
     result_text: str = ""
-    error: dict[str, Any] | None = None
+    error: Problem | None = None
     resume: JobRequest | None = None
     run: str | None = Field(None, description="saved run of an identification, for GET /api/v1/runs/{run}")
     views: int = Field(0, description="number of pictures at GET /api/v1/jobs/{id}/views/{n}")

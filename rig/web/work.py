@@ -17,7 +17,8 @@ from rig.catalog.log import asked_by
 from rig.charts.candidates import Styles, candidates_chart
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError, UsageError
-from rig.core.next_steps import NextSteps, as_steps, steps_as_json
+from rig.core.json_form import plain
+from rig.core.next_steps import NextSteps, as_steps
 from rig.core.plugins import plugins
 from rig.doctor.context import open_context
 from rig.doctor.finding import Finding, finding_words
@@ -106,8 +107,10 @@ class ServedDesk(Desk):
         return open_or_copy(self.place, SystemClock(), create=create, attempts=self._worker.attempts)
 
     def choose(self, question: Question) -> Choice:
-        steps = steps_as_json(as_steps(question.steps))
-        choice, _ = self._ask(requests.JobQuestion(text=question.text, choices=tuple(question.choices), steps=steps))
+        asked = requests.JobQuestion(
+            text=question.text, choices=tuple(question.choices), steps=as_steps(question.steps)
+        )
+        choice, _ = self._ask(asked)
         return choice
 
     def ask_sample(self) -> str | None:
@@ -154,7 +157,7 @@ class ServedDesk(Desk):
 
     def _publish(self, text: str, steps: NextSteps, values: dict[str, Any]) -> None:
         if steps:
-            values["steps"] = steps_as_json(steps)
+            values["steps"] = plain(steps)
         self._worker.publish("plan", {"job": self.job.id, "text": text, **values})
 
     def show(self, event: Event) -> None:

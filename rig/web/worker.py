@@ -19,7 +19,7 @@ from rig.catalog.copying import Attempts
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
-from rig.core.next_steps import steps_as_json
+from rig.core.next_steps import as_steps
 from rig.core.notify import notify
 from rig.devices.servo import ServoState
 from rig.motion.traces import stored
@@ -30,7 +30,6 @@ from rig.web.answers import BenchStatus
 from rig.web.jobs import JobQueue
 from rig.web.link import Link
 from rig.web.picture import LivePicture, jpeg
-from rig.web.problems import problem
 from rig.web.requests import Job, JobState
 from rig.web.setup import Setup
 
@@ -185,7 +184,7 @@ class BenchWorker:
             try:
                 bench.shelf.do(words)
             except RigError as failure:
-                self.publish("shelf", {**bench.shelf.state(), "error": problem(failure)})
+                self.publish("shelf", {**bench.shelf.state(), "error": failure.problem})
                 continue
             if words[0] in ("put", "clear"):
                 self._put = words
@@ -377,17 +376,17 @@ class BenchWorker:
         bench, error = self._bench, self._error
         self._status_ns = self._clock.now_ns()
         values: dict[str, Any] = {"open": bench is not None, "job": self._job.id if self._job else None}
-        values["error"] = plain(error.as_dict()) if error is not None and bench is None else None
+        values["error"] = error.problem if error is not None and bench is None else None
         values["picture_age_s"] = self._picture.age_s
-        values["problem"] = None if (found := self.queue.problem) is None else problem(found)
+        values["problem"] = None if (found := self.queue.problem) is None else found.problem
         if bench is not None:
             safety, config = bench.safety, bench.config
             values |= {
                 "bench": bench.name,
                 "state": str(safety.state),
-                "fault": safety.fault.as_dict() if safety.fault else None,
+                "fault": safety.fault,
                 "doubt": str(safety.doubt) if safety.doubt else None,
-                "steps": steps_as_json(safety.next_step or bench.calibration_steps),
+                "steps": as_steps(safety.next_step or bench.calibration_steps),
                 "limits_deg": list(config.table.limits_deg),
                 "findings": list(bench.findings),
                 "camera": plain(bench.camera.identity),

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from rig.core.errors import RigError, UsageError
+from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import angle_words, percent
 from sim.bench import ShelfOperator
@@ -184,7 +185,7 @@ def run(commands: Commands, words: Sequence[str]) -> dict[str, Any]:
     try:
         return {"text": commands.do(words), "world": commands.state()}
     except RigError as error:
-        return {"failed": error.as_dict(), "world": commands.state()}
+        return {"failed": plain(error.problem), "world": commands.state()}
 
 
 def _arguments(command: str, given: list[str], least: int = 0, most: int = 0) -> list[str]:

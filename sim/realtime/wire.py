@@ -71,7 +71,7 @@ def send_command(folder: Path, *words: str) -> dict[str, Any]:
     finally:
         wire.close()
     if failed := answer.get("failed"):
-        raise UsageError(failed["what"], next_step=steps_from_json(failed["steps"]), evidence=failed["evidence"])
+        raise UsageError(failed["detail"], next_step=steps_from_json(failed["steps"]), evidence=failed["evidence"])
     return answer
 
 

@@ -69,7 +69,7 @@ def test_served_bench_works_without_the_server_and_delivers_once(
         assert "is delivered later" in job["result_text"]
         assert served.run(kind="enroll", name="mug-star", views=4)["state"] == "done"
         taken = served.run(kind="enroll", name="lamp", views=4)  # the local copy has it
-        assert "enrolled already" in taken["error"]["what"]
+        assert "enrolled already" in taken["error"]["detail"]
         assert "does not answer" in served.client.patch("/api/v1/objects/lamp", json={"label": "x"}).json()["detail"]
         assert waiting(place, CLOCK) == 3
     finally:

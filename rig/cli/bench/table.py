@@ -110,7 +110,7 @@ def _report_lines(report: "Mapping[str, Any]") -> Iterator[str]:
     if is_open or page:
         yield f"state    {_state_words(report)}"
     if problem := report.get("error"):
-        yield f"error    {problem['code']}: {problem['what']}"
+        yield f"error    {problem['code']}: {problem['detail']}"
         yield f"         Next step: {problem['next_step']}"
     if limits_deg := report.get("limits_deg"):
         angle_deg = report.get("table_deg")
@@ -122,7 +122,7 @@ def _report_lines(report: "Mapping[str, Any]") -> Iterator[str]:
     for device in ("servo", "imu", "head", "camera"):
         if values := report.get(device):
             error = values.get("error")
-            failed = error and [f"error {error['code']}: {error['what']}", f"Next step: {error['next_step']}"]
+            failed = error and [f"error {error['code']}: {error['detail']}", f"Next step: {error['next_step']}"]
             yield from (f"{'' if n else device:8s} {line}" for n, line in enumerate(failed or _device_lines(values)))
     yield from (f"note     {finding}" for finding in report.get("findings", ()))
     if not report.get("fault") and not report.get("doubt") and (steps := report.get("steps")):
@@ -132,7 +132,7 @@ def _report_lines(report: "Mapping[str, Any]") -> Iterator[str]:
 def _state_words(report: "Mapping[str, Any]") -> str:
     state, fault, doubt = report.get("state", "not open"), report.get("fault"), report.get("doubt")
     if fault is not None:
-        return f"{state} {fault['code']} since {fault['utc']}: {fault['what']} {fault['next_step']}"
+        return f"{state} {fault['code']} since {fault['utc']}: {fault['detail']} {fault['next_step']}"
     return f"{state}: {doubt} (`rig home --help`)" if doubt else str(state)
 
 

@@ -1,7 +1,6 @@
 """`rig enroll`."""
 
 import sys
-from dataclasses import replace as changed
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -97,7 +96,7 @@ def enroll(
         except BaseException:
             view.hide()
             if stored_views:
-                one = changed(Do.CONTINUE_ENROLLMENT(name=name), options=tuple(settings.arguments()))
+                one = Do.CONTINUE_ENROLLMENT(name=name).with_options(settings.arguments())
                 step = one if tray is None else "To continue with the list, run the same command again."
                 print(f"The views taken so far are stored. {in_words(step)}", file=sys.stderr)
             raise

@@ -38,6 +38,7 @@ def replay(
         _check(settings, saved)
         return
     from rig.cli.ui.live import LiveView
+    from rig.events.wording import problem_line
 
     if not settings.json:
         about = saved.about
@@ -47,7 +48,7 @@ def replay(
         for event in saved.events():
             view.add(event)
     if saved.error and not settings.json:
-        print(f"Error {saved.error['code']} ({saved.error['error']}): {saved.error['what']}")
+        print(problem_line(saved.error))
 
 
 @command

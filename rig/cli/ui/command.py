@@ -89,7 +89,7 @@ def show_error(error: RigError, settings: Settings) -> None:
     """Print an error with its evidence and its next step, without a traceback."""
     if settings.json:
         with suppress(OutputFailed):
-            settings.print_json(error.as_dict())
+            settings.print_json(error.problem)
     lines = [f"Error {error.code} ({error.title}): {error.what}"]
     for key, value in error.evidence.items():
         if isinstance(value, list | tuple):

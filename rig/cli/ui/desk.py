@@ -104,7 +104,7 @@ class CommandDesk(Desk):
             state = "done"
             return end.value
         except RigError as error:
-            state, failure = "failed", error.as_dict()
+            state, failure = "failed", error.problem
             raise
         finally:
             steps.close()

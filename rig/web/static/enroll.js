@@ -200,7 +200,7 @@ followJob(["enroll", "tray"], {
     else if (job.state === "queued") say("Waiting for the bench …", "calm");
     else if (busy) say(name || "Preparing …", "calm", `${job.state === "paused" ? "Paused. " : "Keep your hands off the table. "}${left ? `About ${duration(left)} left.` : ""}`);
     else if (job.state === "done") say(job.request.kind === "tray" ? "The tray is enrolled" : `${job.request.name} is enrolled`, "found", h("p", {}, similar && !similar.objects.length ? "It looks like no other enrolled object. " : "", job.request.name && h("a", { href: `/object?name=${at(job.request.name)}` }, "Look at it")), h("p", {}, "Put the next object on the table."));
-    else say(job.state === "failed" ? "Not enrolled" : "Interrupted", "unknown", job.error && h("p", {}, `${job.error.what} `, ...nextSteps(job.error.steps)), job.resume && h("p", {}, h("button", { onclick: () => submit(job.resume) }, job.views || job.request.kind === "tray" ? "Continue" : "Try again")));
+    else say(job.state === "failed" ? "Not enrolled" : "Interrupted", "unknown", job.error && h("p", {}, `${job.error.detail} `, ...nextSteps(job.error.steps)), job.resume && h("p", {}, h("button", { onclick: () => submit(job.resume) }, job.views || job.request.kind === "tray" ? "Continue" : "Try again")));
     showViews();
     if (job.request.kind === "tray" && objects.length && Object.keys(states).length) showTray(false);
     showSimilar();

@@ -144,7 +144,7 @@ function showAnswer(answer) {
   let after = [];
   if (outcome === "failed") {
     const { error } = answer;
-    headline(error.code === EMPTY_TABLE ? "No object on the table" : "No answer", "unknown", error.code === EMPTY_TABLE ? "The table is empty. " : `${error.what} `, ...nextSteps(error.steps));
+    headline(error.code === EMPTY_TABLE ? "No object on the table" : "No answer", "unknown", error.code === EMPTY_TABLE ? "The table is empty. " : `${error.detail} `, ...nextSteps(error.steps));
   } else if (outcome === "found") {
     const sure = answer.confidence === null || answer.confidence === undefined ? "" : `${percent(answer.confidence)} sure`;
     const rotated = answer.yaw_deg === null || answer.yaw_deg === undefined ? "" : `, turned by ${answer.yaw_deg.toFixed(0)}°`;

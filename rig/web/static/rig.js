@@ -248,8 +248,8 @@ function showState(words, kind) {
 
 /** Return the state of the bench in words, and whether it is good or bad. */
 export function stateWords(status) {
-  if (!status.open) return [status.error ? `Bench not available: ${status.error.what}` : "Opening the bench …", "bad"];
-  if (status.fault) return [`Fault ${status.fault.code}: ${status.fault.what}`, "bad"];
+  if (!status.open) return [status.error ? `Bench not available: ${status.error.detail}` : "Opening the bench …", "bad"];
+  if (status.fault) return [`Fault ${status.fault.code}: ${status.fault.detail}`, "bad"];
   if (status.doubt) return [`The table's angle is in doubt: ${status.doubt}.`, "bad"];
   const angle = status.table_deg === null || status.table_deg === undefined ? "" : `, table at ${number(status.table_deg, 1)}°`;
   return [`${status.job ? "Working" : "Ready"}${angle}`, status.job ? "good busy" : "good"];
@@ -406,7 +406,7 @@ export function showJob(box, job, withOutcome = true) {
     );
   }
   if (withOutcome && job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
-  if (withOutcome && job.error) parts.push(h("div", { class: "failure" }, h("p", { class: "error" }, job.error.what), h("p", {}, ...nextSteps(job.error.steps)), h("p", { class: "small soft" }, `Error ${job.error.code}`)));
+  if (withOutcome && job.error) parts.push(h("div", { class: "failure" }, h("p", { class: "error" }, job.error.detail), h("p", {}, ...nextSteps(job.error.steps)), h("p", { class: "small soft" }, `Error ${job.error.code}`)));
   if (job.resume && withOutcome) parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
   box.replaceChildren(...parts);
   if (job.question?.takes_sample) box.querySelector(".question input").focus();

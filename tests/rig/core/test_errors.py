@@ -1,6 +1,7 @@
 """The registry of errors: codes are distinct, and each one gives a documented exit code."""
 
 from rig.core import errors
+from rig.core.json_form import plain
 
 
 def every_class(base=errors.RigError):
@@ -18,10 +19,11 @@ def test_codes_are_distinct_and_give_exit_codes():
 def test_error_has_text_evidence_and_next_step():
     error = errors.DeviceSilent("Servo 1 does not answer.", next_step="Check the cable.", evidence={"baud": 57600})
     assert error.exit_code == 4
-    assert error.as_dict() == {
-        "error": "device silent",
+    assert plain(error.problem) == {
+        "type": "/reference/errors.html#402",
+        "title": "device silent",
         "code": 402,
-        "what": "Servo 1 does not answer.",
+        "detail": "Servo 1 does not answer.",
         "evidence": {"baud": 57600},
         "next_step": "Check the cable.",
         "steps": ["Check the cable."],

@@ -42,7 +42,7 @@ def test_secrets_in_other_values_are_hidden() -> None:
 
 def test_errors_hide_secrets() -> None:
     error = CatalogError("a://b:pw@c fails.", next_step="Check a://b:pw@c.", evidence={"server": "token=pw"})
-    assert "pw" not in f"{error} {error.as_dict()}"
+    assert "pw" not in f"{error} {error.problem}"
 
 
 @pytest.mark.parametrize("part", ["a.", "://:", "?a", "a==", "key ", "@://:", "a=@://", "token ", '"', "password", "="])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from rig.config import RigConfig
 from rig.core.errors import RigError, UsageError
+from rig.core.json_form import plain
 from rig.devices.dynamixel.packets import Reply
 from rig.devices.trace import TracedSerial, TraceEvent, TraceWriter, read_trace
 from rig.doctor.replay import replay_drivers
@@ -77,7 +78,7 @@ def test_any_content_is_a_trace_or_an_error(file: Path):
                 read_trace(file)
             except RigError as failure:
                 error = failure
-                json.dumps(error.as_dict())
+                json.dumps(plain(error.problem), allow_nan=False)
             else:
                 continue
             assert error.next_step

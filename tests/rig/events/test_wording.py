@@ -6,7 +6,8 @@ import pytest
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.model.symmetry import SimilarObject
-from rig.core.next_steps import Do, steps_as_json
+from rig.core.json_form import plain
+from rig.core.next_steps import Do
 from rig.events.events import (
     Candidate,
     Decided,
@@ -211,4 +212,4 @@ def test_warnings_have_a_next_step() -> None:
     for code in (NoteCode.EMPTY_TABLE_CHANGED, NoteCode.TABLE_DIFFERS):
         assert note_steps(Note(code))[-1] == Do.EMPTY_TABLE()
     for steps in (("Wait.",), (Do.FREE_DISK(), Do.ENROLL(name="cup"))):
-        assert note_steps(Note(NoteCode.NOT_RECORDED, {"steps": steps_as_json(steps)})) == steps
+        assert note_steps(Note(NoteCode.NOT_RECORDED, {"steps": plain(steps)})) == steps

@@ -8,6 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NoProgress, NotReady, Stalled
+from rig.core.json_form import plain
 from rig.devices.servo import MotionProfile
 from rig.motion.move import motion_seconds
 from rig.motion.trajectory import TrajectoryRecorder
@@ -329,7 +330,7 @@ def test_timeout_without_gyro_data_is_valid_json():
         with Turntable(bench) as table:
             table._gyro.bias = None
             table._wait_for_rest(60.0, 0.1, 0.5)
-    reported = json.loads(json.dumps(caught.value.as_dict(), allow_nan=False))
+    reported = json.loads(json.dumps(plain(caught.value.problem), allow_nan=False))
     assert reported["evidence"]["peak_rate_dps"] is None
 
 

@@ -64,7 +64,7 @@ def test_answer_is_reported_on_a_full_disk(recorder, monkeypatch):
     assert isinstance(answer, Identified)
     assert isinstance(warned, Warned)
     assert warned.note.code is NoteCode.NOT_RECORDED
-    assert "full" in warned.note.values["what"]
+    assert "full" in warned.note.values["detail"]
     assert Do.FREE_DISK() in note_steps(warned.note)
 
 

@@ -262,7 +262,7 @@ class Bench(RuleBasedStateMachine):
             again = self.process()
             assert again.state is TableState.FAULT
             assert again.fault == self.safety.fault
-            with pytest.raises(FaultLatched, match=self.safety.fault.what):
+            with pytest.raises(FaultLatched, match=self.safety.fault.detail):
                 again.require_ready()
 
 
@@ -357,7 +357,7 @@ def test_first_fault_stays_until_an_acknowledgement_has_checked_all_devices():
     safety.connect()
     safety.latch(Stalled("Blocked.", next_step="Free it."))
     safety.latch(Stalled("The second.", next_step="Free it."))
-    assert safety.fault.what == "Blocked."
+    assert safety.fault.detail == "Blocked."
 
     def gyro() -> None:
         raise UsageError("the gyro is not well", next_step="look at it")

@@ -186,7 +186,7 @@ def test_fault_larger_than_its_file_is_stored_without_evidence(tmp_path):
     store = FileStore(tmp_path)
     store.save(BenchState(table=TABLE))
     store.latch(LatchedFault.of(Stalled("x" * 9000, next_step="y", evidence={"z": "z" * 9000}), "2026-01-02"))
-    assert store.load().fault.what == "x" * 500
+    assert store.load().fault.detail == "x" * 500
     assert (tmp_path / "latch").stat().st_size == LATCH_BYTES
 
 

@@ -251,7 +251,7 @@ def test_replay_reports_a_run_without_its_end(saved, tmp_path):
         done = CliRunner().invoke(app, ["replay", str(folder), "--check"])
         assert done.exit_code == 6, done.output
         assert "Error 604" in done.stderr
-    events.write_bytes(whole + json.dumps({"code": 1, "error": "a", "what": "b"}).encode() + b"\n")
+    events.write_bytes(whole + json.dumps({"code": 1, "title": "a", "detail": "b", "steps": []}).encode() + b"\n")
     assert load_run(folder).error is not None
 
 

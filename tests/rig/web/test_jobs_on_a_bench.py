@@ -311,7 +311,7 @@ def test_doctor_examines_a_bench_that_cannot_be_opened(serve, monkeypatch):
 
     monkeypatch.setattr("rig.web.worker.open_bench", missing)
     served = serve()
-    assert served.run(kind="home")["error"]["what"] == "The camera is missing."
+    assert served.run(kind="home")["error"]["detail"] == "The camera is missing."
     assert served.run(kind="doctor")["state"] == "done"
 
 

@@ -126,7 +126,7 @@ def test_empty_table_is_no_object_with_an_exit_code_of_its_own(rig, monkeypatch)
         done = rig(*words, "--json", "--set", "state_dir=state")  # with the image of the first command
         assert done.exit_code == EXIT_QUALITY
         error = in_json(done)[-1]
-        assert (error["error"], error["code"]) == ("no object", 606)
+        assert (error["title"], error["code"]) == ("no object", 606)
         assert error["next_step"].startswith("Put the object on the table")
     assert rig("results", "list", "--json").stdout == before
     assert "nothing" not in rig("catalog", "list").stdout

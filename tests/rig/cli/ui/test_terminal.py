@@ -105,7 +105,7 @@ def test_mistaken_arguments_are_neutral_and_with_json_an_object():
     assert json.loads(line)["code"] == 200
     assert "--help" in json.loads(line)["next_step"]
     deeper = CliRunner().invoke(app, ["catalog", "show", "--nix", "--json"])
-    assert json.loads(deeper.stdout)["what"].startswith("No such option: --nix")
+    assert json.loads(deeper.stdout)["detail"].startswith("No such option: --nix")
     assert CliRunner().invoke(app, ["catalog", "show", "--nix"]).stdout == ""
 
 
