@@ -15,8 +15,9 @@ from rig.catalog import Catalog
 from rig.catalog.copying import open_or_copy
 from rig.catalog.log import asked_by
 from rig.charts.candidates import Styles, candidates_chart
+from rig.config import RigConfig
 from rig.core.clock import SystemClock
-from rig.core.errors import RigError, UsageError
+from rig.core.errors import UsageError
 from rig.core.json_form import plain
 from rig.core.next_steps import NextSteps, as_steps
 from rig.core.plugins import plugins
@@ -68,7 +69,7 @@ class ServedDesk(Desk):
 
     def __init__(self, worker: BenchWorker, job: Job) -> None:
         self.operator = self
-        self.config = worker.setup.config
+        self.config = worker.config
         self.place = worker.setup.catalog_place
         self.job = job
         self.setup = worker.setup
@@ -87,17 +88,9 @@ class ServedDesk(Desk):
         """Close the bench, for a job that opens its devices itself."""
         self._worker.close()
 
-    def reopen(self, camera: dict[str, Any]) -> None:
-        """Close the bench and open it with other settings of the camera."""
-        worker, before = self._worker, self.setup
-        config = before.config.model_copy(update={"camera": before.config.camera.model_copy(update=camera)})
-        worker.close()
-        worker.setup = before.model_copy(update={"config": config})
-        try:
-            worker.bench()
-        except RigError:
-            worker.setup = before
-            raise
+    def open_anew(self, config: RigConfig) -> None:
+        """Open the bench again, with this configuration from now on."""
+        self._worker.open(config)
 
     def who_places(self, bench: Bench) -> Operator:  # noqa: ARG002
         return self
@@ -245,13 +238,15 @@ def _identify(desk: ServedDesk, **parameters: Any) -> Steps[Identified | None]:
 def _examine(desk: ServedDesk) -> Steps[None]:
     desk.close_bench()  # the checks open the devices themselves
     setup = desk.setup
-    opened = open_context(setup.bench, setup.config, seed=setup.seed, options=setup.arguments, is_held=True)
+    opened = open_context(setup.bench, desk.config, seed=setup.seed, options=setup.arguments, is_held=True)
     return examine(setup.bench, opened)
 
 
 def _lock_camera(desk: ServedDesk, **settings: float | None) -> Steps[None]:
-    """Open the bench with other settings of its camera; if it does not take them, with those before."""
-    desk.reopen({key: value for key, value in settings.items() if value is not None})
+    """Open the bench with other settings of its camera; if it does not take them, the next job has those before."""
+    given = {key: value for key, value in settings.items() if value is not None}
+    camera = desk.config.camera.model_copy(update=given)
+    desk.open_anew(desk.config.model_copy(update={"camera": camera}))
     yield JobResult(settings, "The camera is locked with these settings.")
 
 

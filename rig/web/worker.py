@@ -16,6 +16,7 @@ from pydantic import validate_call
 
 from rig.bench import Bench, open_bench
 from rig.catalog.copying import Attempts
+from rig.config import RigConfig
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
@@ -68,6 +69,8 @@ class BenchWorker:
             self.publish("job", job)
 
         self.setup = setup
+        self.config = setup.config
+        """The configuration with which the bench was opened last."""
         self.attempts = Attempts(clock)
         """Those to open the catalog."""
         self.status = BenchStatus()
@@ -295,24 +298,28 @@ class BenchWorker:
 
     def bench(self) -> Bench:
         """Return the bench; it is opened if it is not open."""
-        if self._bench is None:
-            self._tried_ns = self._clock.now_ns()
-            try:
-                bench = open_bench(self.setup.bench, self.setup.config, seed=self.setup.seed)
-            except RigError as error:
-                self._error = error
-                self._read_status()
-                raise
-            if bench.shelf is not None:  # the person at the page takes the objects from the shelf
-                bench.placer = None
-                self._hands.extend([self._put] if self._put else [])
-            bench.camera.observers += [self._picture.show, lambda _: self._use_hands()]
-            bench.safety.observers.append(self._observe)
-            bench.safety.monitors.append(self._check_stop)
-            self._locks = plain(bench.camera.read_locks())
-            self._bench, self._error = bench, None
+        return self.open(self.config) if self._bench is None else self._bench
+
+    def open(self, config: RigConfig) -> Bench:
+        """Open the bench anew with a configuration; if that succeeds, it is opened with this one from now on."""
+        self.close()
+        self._tried_ns = self._clock.now_ns()
+        try:
+            bench = open_bench(self.setup.bench, config, seed=self.setup.seed)
+        except RigError as error:
+            self._error = error
             self._read_status()
-        return self._bench
+            raise
+        if bench.shelf is not None:  # the person at the page takes the objects from the shelf
+            bench.placer = None
+            self._hands.extend([self._put] if self._put else [])
+        bench.camera.observers += [self._picture.show, lambda _: self._use_hands()]
+        bench.safety.observers.append(self._observe)
+        bench.safety.monitors.append(self._check_stop)
+        self._locks = plain(bench.camera.read_locks())
+        self._bench, self._error, self.config = bench, None, config
+        self._read_status()
+        return bench
 
     def close(self, error: BaseException | None = None) -> None:
         """Close the bench; ``error`` is why."""
