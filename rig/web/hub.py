@@ -28,11 +28,15 @@ MAX_LISTENERS: Final = 200  # each keeps a connection open and gets every event
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message: ``kind`` is the name of the server-sent event, ``data`` its JSON text."""
+    """A message: ``kind`` is the name of the server-sent event, ``data`` its JSON text.
+
+    ``job`` is the id of the job whose event it is, if it is one.
+    """
 
     number: int
     kind: str
     data: str
+    job: str | None = None
 
 
 class Hub:
@@ -53,12 +57,12 @@ class Hub:
         self._closed = False
         self.listeners = 0
 
-    def publish(self, kind: str, data: Any) -> None:
-        """Add a message, from any thread; ``data`` are JSON values."""
+    def publish(self, kind: str, data: Any, job: str | None = None) -> None:
+        """Add a message, from any thread; ``data`` are JSON values, ``job`` is the id of the job whose event it is."""
         text = json.dumps(data, ensure_ascii=False, allow_nan=False, default=str)
         with self._lock:
             self._last += 1
-            self._messages.append(Message(self._last, kind, text))
+            self._messages.append(Message(self._last, kind, text, job))
             self._size += len(text)
             while len(self._messages) > self._capacity or (self._size > MAX_SIZE and len(self._messages) > 1):
                 self._size -= len(self._messages.popleft().data)
@@ -80,9 +84,8 @@ class Hub:
 
     def of_job(self, job_id: str) -> tuple[list[str], str]:
         """Return the stored events of a job as JSON texts, and the id of the newest message."""
-        begin = f'{{"job": "{job_id}"'  # as the process of the bench writes them
         with self._lock:
-            found = [one.data for one in self._messages if one.kind == "plan" and one.data.startswith(begin)]
+            found = [one.data for one in self._messages if one.job == job_id]
             return found, f"{self._epoch}-{self._last}"
 
     def position(self, last_event_id: str | None) -> tuple[int, bool]:

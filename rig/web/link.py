@@ -158,7 +158,7 @@ def _json_values(value: Any) -> Any:
 class RemoteBench(Link):
     """The bench of another process: calls to the functions of `rig.web.worker.BenchWorker`, its events, and STOP.
 
-    ``received`` gets the kind and the values of each event.
+    ``received`` gets the kind and the values of each event, and the id of the job that it is of.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class RemoteBench(Link):
         connection: socket.socket,
         state_folder: Path,
         clock: Clock,
-        received: Callable[[str, Any], None],
+        received: Callable[[str, Any, str | None], None],
         ended: Callable[[], None],
     ) -> None:
         super().__init__(connection, {"publish": self._published}, ended)
@@ -180,10 +180,10 @@ class RemoteBench(Link):
         self._fetched_ns: int | None = None
         self._fetching = asyncio.Lock()
 
-    def _published(self, kind: str, data: Any) -> None:
+    def _published(self, kind: str, data: Any, job: str | None) -> None:
         if kind == "status":
             self.status = data
-        self._take(kind, data)
+        self._take(kind, data, job)
 
     # -- STOP: it asks no queue, no thread and no disk ----------------------------------------------------------------
 

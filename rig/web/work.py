@@ -151,7 +151,7 @@ class ServedDesk(Desk):
     def _publish(self, text: str, steps: NextSteps, values: dict[str, Any]) -> None:
         if steps:
             values["steps"] = plain(steps)
-        self._worker.publish("plan", {"job": self.job.id, "text": text, **values})
+        self._worker.publish("plan", {"job": self.job.id, "text": text, **values}, self.job)
 
     def show(self, event: Event) -> None:
         """Show an event; then pause or cancel the job if the operator asked for it."""

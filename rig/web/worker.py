@@ -132,10 +132,10 @@ class BenchWorker:
         self.publish("status", self.status)
         return link
 
-    def publish(self, kind: str, data: Any) -> None:
-        """Send a message to the listeners of the web process, if there is one: its kind and its JSON values."""
+    def publish(self, kind: str, data: Any, job: Job | None = None) -> None:
+        """Send a message to the listeners of the web process, if there is one; ``job`` if it is an event of one."""
         if self._link is not None:
-            self._link.tell("publish", kind=kind, data=data)
+            self._link.tell("publish", kind=kind, data=data, job=None if job is None else job.id)
 
     def _view(self, job_id: str, number: int) -> str:
         pictures = self.views.get(job_id, [])

@@ -160,8 +160,8 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
         publish = served.worker.publish
         request: dict[int, str] = {}
 
-        def published(kind: str, data: Any) -> None:
-            publish(kind, data)
+        def published(kind: str, data: Any, job: Any = None) -> None:
+            publish(kind, data, job)
             if kind == "plan":
                 values.append({"plan": dict(data)})
                 if data["event"] == "accepted" and (path := request.pop(data["picture"] + 1, None)):

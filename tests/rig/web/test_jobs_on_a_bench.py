@@ -187,8 +187,8 @@ def test_job_that_meets_an_interrupted_enrollment_offers_to_continue_it(serve):
     worker = served.worker
     publish = worker.publish
 
-    def published(kind: str, data: Any) -> None:
-        publish(kind, data)
+    def published(kind: str, data: Any, job: Any = None) -> None:
+        publish(kind, data, job)
         if kind == "plan" and data.get("picture") == 1:
             assert served.client.post(f"/api/v1/jobs/{data['job']}/cancel").status_code == 200
 

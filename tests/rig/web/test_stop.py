@@ -227,8 +227,8 @@ def test_stop_during_a_pause_within_a_search_holds_the_cable_budget(serve):
     worker = served.worker
     publish, moved = worker.publish, []
 
-    def published(kind: str, data: Any) -> None:
-        publish(kind, data)
+    def published(kind: str, data: Any, job: Any = None) -> None:
+        publish(kind, data, job)
         if kind == "plan" and data["event"] in ("decided", "frame_used") and not moved:
             moved.append(data["event"])
             assert served.client.post(f"/api/v1/jobs/{data['job']}/pause").status_code == 200
