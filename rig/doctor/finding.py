@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 from rig.core.errors import RigError
-from rig.core.json_form import plain
 from rig.core.masking import masked
 from rig.core.next_steps import Do, NextStep, NextSteps, SomeSteps, as_steps, in_words
 from rig.core.phrases import filled
@@ -310,17 +309,24 @@ class Finding:
         """What fixes the problem, as a terminal shows it."""
         return in_words(self.steps)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the finding as `--json` prints it."""
-        return {
-            "topic": self.topic,
-            "level": str(self.level),
-            "code": self.code.name.lower(),
-            "finding": finding_words(self),
-            "fix": self.fix or None,
-            "steps": plain(self.steps),
-            "evidence": _as_json(self.parameters),
-        }
+    @property
+    def reported(self) -> "ReportedFinding":
+        """The finding as `--json` and the server give it."""
+        code, words, evidence = self.code.name.lower(), finding_words(self), _as_json(self.parameters)
+        return ReportedFinding(self.topic, self.level, code, words, self.fix or None, self.steps, evidence)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedFinding:
+    """A finding in words, with its ``evidence`` as JSON values."""
+
+    topic: str
+    level: Severity
+    code: str
+    finding: str
+    fix: str | None
+    steps: NextSteps
+    evidence: dict[str, Any]
 
 
 def graded(*, bad: bool, warning: bool = False) -> Severity:

@@ -36,9 +36,9 @@ class Remark:
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """The result of a job that ends without an event: its JSON values, and a sentence."""
+    """The result of a job that ends without an event: its values, which are JSON or a model of it, and a sentence."""
 
-    values: dict[str, Any]
+    values: Any
     text: str
 
 

@@ -3,9 +3,9 @@
 import json
 import platform
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import distributions
 from io import BytesIO
 from pathlib import Path
@@ -20,9 +20,20 @@ from rig.core.masking import masked
 from rig.doctor import examination
 from rig.doctor.checks import CHECKS
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, Severity, of_error
+from rig.doctor.finding import Finding, FindingCode, ReportedFinding, Severity, of_error
 from rig.jobs.desk import JobResult, Steps
 from rig.safety.saved_state import FileStore
+
+
+@dataclass(frozen=True, slots=True)
+class Examined:
+    """What was found on a bench, the number of problems and of warnings, and the exit code of the first problem."""
+
+    bench: str
+    bad: int
+    warnings: int
+    exit_code: int
+    findings: list[ReportedFinding]
 
 
 def check_configuration(
@@ -66,15 +77,9 @@ def examine(
         yield finding
     count = Counter(finding.level for finding in findings)
     problems, warnings = count[Severity.BAD], count[Severity.WARNING]
-    values = {
-        "bench": bench,
-        "bad": problems,
-        "warnings": warnings,
-        "exit_code": next((finding.exit_code for finding in findings if finding.level is Severity.BAD), 0),
-        "findings": [finding.as_dict() for finding in findings],
-    }
+    exit_code = next((finding.exit_code for finding in findings if finding.level is Severity.BAD), 0)
     yield JobResult(
-        values,
+        Examined(bench, problems, warnings, exit_code, [finding.reported for finding in findings]),
         f"{problems or 'No'} problem{'s' * (problems != 1)}, {warnings or 'no'} warning{'s' * (warnings != 1)}, "
         f"{count[Severity.FINE]} fine.",
     )
@@ -92,7 +97,7 @@ def _findings(
 
 
 def support_bundle(
-    findings: Sequence[Mapping[str, Any]],
+    findings: Sequence[ReportedFinding],
     load: Callable[[], RigConfig],
     file: Path | None,
     bench: str | None,
@@ -122,7 +127,7 @@ def support_bundle(
         parts["rig.toml"] = lambda: str(masked(file.read_text("utf-8"))).encode()
     if trace is not None:
         parts["trace.jsonl"] = trace
-    contents: dict[str, bytes] = {"findings.json": _masked_json(findings)}
+    contents: dict[str, bytes] = {"findings.json": _masked_json(plain(findings))}
     missing: list[str] = []
     for name, read in parts.items():
         try:

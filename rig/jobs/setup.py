@@ -25,7 +25,7 @@ def find(opened: AbstractContextManager[DoctorContext], progress: Callable[[str]
         try:
             while True:
                 step = next(scan)
-                findings += [step.as_dict()] if isinstance(step, Finding) else []
+                findings += [step.reported] if isinstance(step, Finding) else []
                 yield step
         except StopIteration as end:
             wanted: dict[Key, Any] = end.value

@@ -1,6 +1,7 @@
 """The jobs that rotate the table, set its angle, and acknowledge a fault."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
@@ -8,7 +9,6 @@ from rig.bench import Bench
 from rig.catalog import Action
 from rig.config import MAX_LIMIT_DEG
 from rig.core.errors import RigError, Unreferenced, UsageError
-from rig.core.json_form import plain
 from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import angle_words, counted, signed
 from rig.jobs.desk import Desk, JobResult, Remark, Steps
@@ -16,6 +16,8 @@ from rig.motion.turntable import Turntable
 from rig.plans.operator import Choice, Question, Subject
 from rig.plans.steps import announced, moved
 from rig.safety.angle_reference import AngleFinding, SavedAngleCheck
+from rig.safety.saved_state import LatchedFault
+from rig.safety.supervisor import TableState
 from rig.views.charuco_board import CharucoBoard, detect_board, mark_angle_deg
 
 DEVICES: Final = ("imu",)
@@ -28,6 +30,22 @@ OTHERWISE: Final[dict[Subject, SomeSteps]] = {
 STEPS_DEG: Final = (0.5, 1.0, 5.0, 15.0, 45.0, 90.0)
 """Steps of jog, from seeing whether the table moves to a quarter of a revolution."""
 LEAVE: Final = {Choice.CONTINUE: "rotate", Choice.STOP: "leave it"}
+
+
+@dataclass(frozen=True, slots=True)
+class TableAngle:
+    """The angle of the table after it was set."""
+
+    table_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledged:
+    """The fault that was acknowledged, if one was latched, and the state of the table since then."""
+
+    acknowledged: LatchedFault | None
+    state: TableState
+    doubt: str | None
 
 
 class JogKey(Enum):
@@ -179,7 +197,7 @@ def refer(desk: Desk, *, revolutions: int | None = None, here: bool = False) -> 
             bench.safety.set_revolutions(revolutions)
         table_deg = bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg)
     text = "The present angle is home now." if here else "The table's angle is set."
-    yield JobResult({"table_deg": 0.0 if here else table_deg}, text)
+    yield JobResult(TableAngle(0.0 if here else table_deg), text)
 
 
 def acknowledge(desk: Desk, *, reboot: bool = False) -> Steps[None]:
@@ -188,9 +206,5 @@ def acknowledge(desk: Desk, *, reboot: bool = False) -> Steps[None]:
         fault = bench.safety.fault
         state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
     text = f"Acknowledged: {fault.detail}" if fault else "No fault was latched."
-    values = {
-        "acknowledged": plain(fault),
-        "state": str(state),
-        "doubt": str(doubt) if doubt else None,
-    }
+    values = Acknowledged(fault, state, str(doubt) if doubt else None)
     yield JobResult(values, f"{text}\nThe table is {state}{f': {doubt}' if doubt else ''}.")

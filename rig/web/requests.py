@@ -1,12 +1,15 @@
 """What clients send: a model for each kind of job, and the bodies of the other requests; and what a job looks like."""
 
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rig.core.errors import Problem
 from rig.core.next_steps import NextSteps
+from rig.events.events import Enrolled, Identified
+from rig.jobs.doctor import Examined
+from rig.jobs.table import Acknowledged, TableAngle
 from rig.plans.operator import Choice
 
 
@@ -114,14 +117,19 @@ class DoctorRequest(_Request):
     kind: Literal["doctor"] = "doctor"
 
 
-class CameraRequest(_Request):
-    """Open the camera again with other locked settings; what is missing stays. They last until the server ends."""
+class CameraSettings(_Request):
+    """Locked settings of the camera."""
 
-    kind: Literal["camera"] = "camera"
     exposure_us: Annotated[float | None, Field(ge=1, le=1e6)] = None
     gain: Annotated[float | None, Field(ge=0, le=1e6)] = None
     white_balance_k: Annotated[float | None, Field(ge=1000, le=20_000)] = None
     focus: Annotated[float | None, Field(ge=0, le=1e6)] = None
+
+
+class CameraRequest(CameraSettings):
+    """Open the camera again with other locked settings; what is missing stays. They last until the server ends."""
+
+    kind: Literal["camera"] = "camera"
 
 
 class CalibrateRequest(_Request):
@@ -157,6 +165,23 @@ class JobQuestion(_Request):
     takes_sample: bool = False
 
 
+class CalibrationRun(_Request):
+    """A calibration that a job has run, with its outcome in words."""
+
+    name: str
+    passed: bool
+    text: str
+
+
+class Calibrated(_Request):
+    """The result of a job ``calibrate``."""
+
+    calibrations: list[CalibrationRun]
+
+
+JobOutcome = Enrolled | Identified | TableAngle | Acknowledged | Examined | CameraSettings | Calibrated
+
+
 class JobState(StrEnum):
     """State of a job."""
 
@@ -187,12 +212,10 @@ class StepsDone(_Request):
 class Job(BaseModel):
     """A job of the bench.
 
-    ``key`` is the header ``Idempotency-Key`` of its request. ``error`` has the fields of an error as ``rig --json``
-    prints them. ``resume`` is the request that continues the job's work; None if there is nothing to continue.
-    ``result`` is the last important event of the plan. A proposed job waits until an operator approves it.
+    ``key`` is the header ``Idempotency-Key`` of its request. ``resume`` is the request that continues the job's work;
+    None if there is nothing to continue. ``result`` is the last important event of the plan, or what a job without one
+    found. A proposed job waits until an operator approves it.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     id: str
     request: JobRequest
@@ -205,7 +228,7 @@ class Job(BaseModel):
     ended_utc: str | None = None
     progress: StepsDone | None = None
     question: JobQuestion | None = None
-    result: dict[str, Any] | None = None
+    result: JobOutcome | None = None
     result_text: str = ""
     error: Problem | None = None
     resume: JobRequest | None = None

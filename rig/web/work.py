@@ -177,7 +177,7 @@ class ServedDesk(Desk):
             self._ranked.append(event)
             self._worker.charts[job.id] = candidates_chart(self._ranked, self._styles).svg(alone=True)
         if isinstance(event, Enrolled | Identified):
-            job.result, job.result_text = event_dict(event), text
+            job.result, job.result_text = event, text
         self._publish(text, next_steps(event), values)
         if isinstance(event, Started | Accepted):
             self._worker.queue.update(job, durable=job.views == 1)
@@ -247,7 +247,7 @@ def _lock_camera(desk: ServedDesk, **settings: float | None) -> Steps[None]:
     given = {key: value for key, value in settings.items() if value is not None}
     camera = desk.config.camera.model_copy(update=given)
     desk.open_anew(desk.config.model_copy(update={"camera": camera}))
-    yield JobResult(settings, "The camera is locked with these settings.")
+    yield JobResult(requests.CameraSettings(**settings), "The camera is locked with these settings.")
 
 
 def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:
@@ -263,8 +263,10 @@ def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:
                 yield Remark(step.text)
             else:
                 yield step
-    values = [{"name": one.values["name"], "passed": one.values["passed"], "text": one.text} for one in results]
-    yield JobResult({"calibrations": values}, "\n".join(one.text for one in results))
+    ran = [
+        requests.CalibrationRun(name=one.values["name"], passed=one.values["passed"], text=one.text) for one in results
+    ]
+    yield JobResult(requests.Calibrated(calibrations=ran), "\n".join(one.text for one in results))
 
 
 JOBS: Final[dict[type[BaseModel], Callable[..., Steps[object]]]] = {

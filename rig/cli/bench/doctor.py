@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rig.doctor.context import DoctorContext
     from rig.doctor.finding import Finding
     from rig.jobs.desk import Steps
+    from rig.jobs.doctor import Examined
 
 
 @command
@@ -68,7 +69,7 @@ def doctor(
     found = print_findings(settings)
     if bundle is not None:
         packed = support_bundle(
-            found["findings"],
+            found.findings,
             settings.load,
             settings.config or default_path(),
             settings.bench,
@@ -77,8 +78,8 @@ def doctor(
         )
         write_new(bundle, packed)
         print(f"Support bundle: {bundle}. Look through it before you send it.", file=sys.stderr)
-    if found["exit_code"]:
-        raise typer.Exit(found["exit_code"])
+    if found.exit_code:
+        raise typer.Exit(found.exit_code)
 
 
 def still_trace(settings: Settings) -> bytes:
@@ -96,8 +97,8 @@ def still_trace(settings: Settings) -> bytes:
         return file.read_bytes()
 
 
-def print_findings(settings: Settings) -> dict[str, Any]:
-    """Check the bench, print the findings, and return the result as `--json` prints it."""
+def print_findings(settings: Settings) -> "Examined":
+    """Check the bench, print the findings, and return the result."""
     from rig.config import RigConfig
     from rig.config.values import default_path
     from rig.jobs.doctor import check_configuration, examine
@@ -105,16 +106,17 @@ def print_findings(settings: Settings) -> dict[str, Any]:
     config, known = check_configuration(settings.load, settings.config or default_path())
     bench = settings.bench or (config or RigConfig()).default_bench
     opened = doctor_context(settings, default=config is None)
-    return _shown(settings, examine(bench, opened, known=known, progress=show_progress))
+    found: Examined = _shown(settings, examine(bench, opened, known=known, progress=show_progress))
+    return found
 
 
-def _shown(settings: Settings, steps: "Steps[None]") -> dict[str, Any]:
+def _shown(settings: Settings, steps: "Steps[None]") -> Any:
     """Print what a job yields, with --json only its result; return the result."""
     from rig.cli.ui.present import console
     from rig.doctor.finding import Finding
     from rig.jobs.desk import JobResult, Remark
 
-    screen, result = console(), dict[str, Any]()
+    screen, result = console(), None
     for step in steps:
         if isinstance(step, JobResult):
             result = step.values
@@ -156,7 +158,7 @@ def setup(settings: Settings) -> None:
     # A new file has no settings of the file in force: that may belong to another bench.
     now = settings if path.exists() else replace(settings, config=None, search=False)
     _shown(settings, set_up(path, doctor_context(now), show_progress))
-    if code := print_findings(replace(settings))["exit_code"]:  # a copy reads the file again
+    if code := print_findings(replace(settings)).exit_code:  # a copy reads the file again
         raise typer.Exit(code)
 
 

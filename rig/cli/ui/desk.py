@@ -95,7 +95,7 @@ class CommandDesk(Desk):
                         values = {"event": "progress", "share": progress.share, "words": progress.words}
                         self._settings.say(progress.words, values)
                     case Finding() as finding:
-                        self._settings.say(finding_words(finding), finding.as_dict())
+                        self._settings.say(finding_words(finding), finding.reported)
                     case event if show is not None:
                         show(event)
                     case event:
