@@ -1,4 +1,4 @@
-"""A command of the user that hears when a job has ended or a fault was latched."""
+"""What a program tells beside its work: to a command of the user, and as a note on stderr."""
 
 import json
 import subprocess
@@ -27,6 +27,12 @@ def notify(command: Sequence[str], message: Mapping[str, Any]) -> None:
         content = json.dumps(plain(message), ensure_ascii=False, default=str) + "\n"
         _last[:] = [threading.Thread(target=_run, args=(list(command), content, *_last), name="notify")]
         _last[0].start()
+
+
+def print_note(text: str) -> None:
+    """Print a note on stderr, from any thread, unless it is closed."""
+    with suppress(OSError):
+        print(f"Note: {text}", file=sys.stderr, flush=True)
 
 
 def _run(command: list[str], content: str, before: threading.Thread | None = None) -> None:

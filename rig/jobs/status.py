@@ -15,6 +15,7 @@ from rig.core.json_form import plain
 from rig.core.next_steps import Do, as_steps
 from rig.devices.camera import Camera
 from rig.devices.imu import Imu, open_imu
+from rig.devices.servo import ServoState
 from rig.doctor.camera import open_camera
 from rig.doctor.context import DoctorContext
 from rig.safety.saved_state import ServerAddress, server_address
@@ -42,23 +43,32 @@ def bench_report(
         return _report_of(bench)
 
 
-def _report_of(bench: Bench) -> dict[str, Any]:
-    state, safety = bench.servo.read_state(), bench.safety
-    report: dict[str, Any] = {
+def bench_facts(bench: Bench, servo: ServoState | None) -> dict[str, Any]:
+    """Return what an open bench says about itself; ``servo`` is its last reading, if there is one."""
+    safety = bench.safety
+    known = None if safety.doubt else servo  # an angle in doubt is not shown as one
+    return {
         "bench": bench.name,
-        "state": str(safety.state),
+        "state": safety.state,
         "fault": safety.fault,
         "doubt": str(safety.doubt) if safety.doubt else None,
-        "table_deg": None if safety.doubt else safety.angle_reference.to_table(state.position_deg),
-        "limits_deg": list(bench.config.table.limits_deg),
+        "table_deg": None if known is None else safety.angle_reference.to_table(known.position_deg),
+        "limits_deg": bench.config.table.limits_deg,
+        "findings": list(bench.findings),
+        "steps": as_steps(safety.next_step or bench.calibration_steps),
+    }
+
+
+def _report_of(bench: Bench) -> dict[str, Any]:
+    state = bench.servo.read_state()
+    devices = {
         "servo": {**plain(bench.servo.identity), **plain(state), "bus": dict(bench.servo.bus_statistics)},
         "imu": _read(lambda: _imu_values(bench.imu)),
         **({"head": bench.head.report()} if bench.head else {}),
         "camera": _read(lambda: _camera_values(bench.camera)),
     }
-    steps = safety.next_step or bench.calibration_steps
-    # Opening the camera adds some findings.
-    return dict(plain({**report, "findings": list(bench.findings), "steps": as_steps(steps)}))
+    # The facts come last, because opening the camera adds some findings.
+    return dict(plain({**devices, **bench_facts(bench, state)}))
 
 
 def _report_without_servo(context: DoctorContext, missing: RigError) -> dict[str, Any]:

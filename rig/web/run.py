@@ -22,9 +22,10 @@ from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import RigError, UsageError, WebEnded, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do
+from rig.core.notify import print_note
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, BenchLock, ServerAddress
 from rig.web.link import Link
-from rig.web.setup import BENCH_NICE, Listening, Setup, print_note, set_priority, shorten_pauses
+from rig.web.setup import BENCH_NICE, Listening, Setup, set_priority, shorten_pauses
 from rig.web.work import run_job
 from rig.web.worker import BenchWorker
 

@@ -23,11 +23,12 @@ from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.core.next_steps import Do
+from rig.core.notify import print_note
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions, Tokens
 from rig.web.hub import Hub
 from rig.web.link import RemoteBench
-from rig.web.setup import Setup, print_note
+from rig.web.setup import Setup
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"

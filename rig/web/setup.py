@@ -2,7 +2,6 @@
 
 import gc
 import os
-import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -62,12 +61,6 @@ class Setup(BaseModel):
     def runs(self) -> Path:
         """Folder of the saved runs."""
         return self.config.catalog_path(self.bench) / "runs"
-
-
-def print_note(text: str) -> None:
-    """Print a note on stderr, unless it is closed."""
-    with suppress(OSError):
-        print(f"Note: {text}", file=sys.stderr, flush=True)
 
 
 def set_priority(nice: int) -> None:

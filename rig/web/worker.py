@@ -20,9 +20,9 @@ from rig.config import RigConfig
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
-from rig.core.next_steps import as_steps
 from rig.core.notify import notify
 from rig.devices.servo import ServoState
+from rig.jobs.status import bench_facts
 from rig.motion.traces import stored
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.safety.stop_channel import StopAnswer, StopListener, listen
@@ -387,25 +387,10 @@ class BenchWorker:
         values["picture_age_s"] = self._picture.age_s
         values["problem"] = None if (found := self.queue.problem) is None else found.problem
         if bench is not None:
-            safety, config = bench.safety, bench.config
-            values |= {
-                "bench": bench.name,
-                "state": str(safety.state),
-                "fault": safety.fault,
-                "doubt": str(safety.doubt) if safety.doubt else None,
-                "steps": as_steps(safety.next_step or bench.calibration_steps),
-                "limits_deg": list(config.table.limits_deg),
-                "findings": list(bench.findings),
-                "camera": plain(bench.camera.identity),
-                "locks": self._locks,
-                "region": list(config.view.roi) if config.view.roi else None,
-            }
-        # An angle in doubt is not shown as one.
+            values |= bench_facts(bench, state)
+            values |= {"camera": bench.camera.identity, "locks": self._locks, "region": bench.config.view.roi}
         if bench is not None and state is not None:
-            known = bench.safety.doubt is None
-            table_deg = bench.safety.angle_reference.to_table(state.position_deg) if known else None
             values |= {
-                "table_deg": table_deg,
                 "velocity_dps": state.velocity_dps,
                 "servo": {
                     "model": bench.servo.identity.model,

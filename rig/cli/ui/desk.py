@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from typing import Any
 
 from rig.bench import Bench
@@ -17,7 +17,7 @@ from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
 from rig.core.next_steps import in_words
-from rig.core.notify import notify
+from rig.core.notify import notify, print_note
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
 from rig.events.wording import line
@@ -69,7 +69,7 @@ class CommandDesk(Desk):
 
     def background_delivery(self) -> BackgroundDelivery:
         """Return a delivery of the journal during the work of a ``with`` block; its results are printed on stderr."""
-        return BackgroundDelivery(self.place, SystemClock(), _print_note)
+        return BackgroundDelivery(self.place, SystemClock(), print_note)
 
     def preparing(self) -> AbstractContextManager[Callable[[JobProgress], None]]:
         return ProgressBar("Preparing objects for searches")
@@ -119,9 +119,3 @@ class CommandDesk(Desk):
         notify(
             self.config.notify_command, {"event": "job", "bench": bench, "text": f"{bench}: {kind} {state}", "job": job}
         )
-
-
-def _print_note(text: str) -> None:
-    """Print a note from another thread, unless stderr is closed."""
-    with suppress(OSError):
-        print(f"Note: {text}", file=sys.stderr, flush=True)
