@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 
 from rig.catalog import Catalog, derived
-from rig.core.errors import LimitExceeded, Stalled
+from rig.core.errors import Stalled
 from rig.events.events import Accepted, Enrolled, Identified, Moved, Unwinding
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
@@ -86,12 +86,3 @@ def test_answer_is_reported_although_the_cable_cannot_be_unwound(simulated, cata
     assert isinstance(events[-1], Identified)
     assert events[-1].candidates[0].name == "toy-car"
     assert s.bench.safety.fault.code == Stalled.code
-
-
-def test_target_beyond_the_budget_is_rejected_with_limits(simulated):
-    s = simulated()
-    with Turntable(s.bench) as table:
-        table.goto(20.0)
-        with pytest.raises(LimitExceeded, match=r"from 19\.6° to 401\.0°.*−1\.11 to \+1\.11 revolutions"):
-            table.goto(401.0)
-        assert table.goto(25.0).agrees  # a rejection is no fault

@@ -11,7 +11,7 @@ from rig.catalog import Catalog
 from rig.config import load_config
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
-from rig.events.events import Accepted, Enrolled, Moved, Started
+from rig.events.events import Accepted, Enrolled, Started
 from rig.motion.move import MotionTimes
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
@@ -46,16 +46,6 @@ def test_plan_of_another_bench_is_shifted_by_revolutions_or_rejected():
     with pytest.raises(LimitExceeded) as caught:
         table_angles(even_azimuths(72, (-400, 400)), (-180, 185))
     assert Do.ENROLL_AGAIN() in caught.value.steps
-
-
-def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulated, tmp_path):
-    s = simulated("table.limits_deg=[-180, 185]")
-    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        moves = [e for e in enroll(s.bench, catalog, "dice", views=6) if isinstance(e, Moved)]
-        assert [m.commanded_deg for m in moves] == [-120.0, -60.0, 0.0, 60.0, 120.0, 180.0]
-        assert sorted(round(v.azimuth_deg) % 360 for v in catalog.object("dice").views) == [
-            0, 60, 120, 180, 240, 300,
-        ]  # fmt: skip
 
 
 @pytest.mark.parametrize("views", [8, pytest.param(36, marks=pytest.mark.nightly)])

@@ -9,7 +9,6 @@ from rig.catalog import Catalog, derived
 from rig.config import load_config
 from rig.core.errors import (
     CatalogError,
-    RotationDisagreement,
 )
 from rig.events.events import Accepted, Decided, Identified, Moved, Ranked
 from rig.plans.enroll import enroll
@@ -77,16 +76,6 @@ def test_each_ranking_follows_from_the_accepted_images(shelf_of_three):
             assert event.margin == pytest.approx(hbr.score_margin(again, np.array(queries)) / len(queries), abs=1e-3)
 
 
-def test_cable_is_unwound_when_a_decision_would_leave_the_limits(simulated, shelf_of_three):
-    _, index = shelf_of_three
-    s = simulated("table.limits_deg=[-180, 185]", "identify.margin=1", "identify.max_views=6", seed=2)
-    s.operator.next_object = "lamp"
-    for event in identify(s.bench, index):
-        if isinstance(event, Decided):
-            assert -180 <= event.target_deg <= 185
-    assert -181 <= s.world.shaft()[0] <= 186
-
-
 def test_identification_uses_the_gyro_when_the_platter_slips_a_little(shelf_of_three):
     s, index = shelf_of_three
     s.operator.next_object, s.operator.yaw_deg = "toy-car", 10.0
@@ -100,17 +89,6 @@ def test_identification_uses_the_gyro_when_the_platter_slips_a_little(shelf_of_t
             off_deg = wrap180(event.azimuth_deg + s.world.table_deg())
     assert not moves[1].agrees
     assert off_deg == pytest.approx(0, abs=4 * moves[1].imu_sigma_deg)
-
-
-def test_loose_platter_ends_an_identification_during_the_move(shelf_of_three):
-    s, index = shelf_of_three
-    s.operator.next_object = "toy-car"
-    with pytest.raises(RotationDisagreement, match="so far"):
-        for event in identify(s.bench, index):
-            if isinstance(event, Decided):
-                s.world.clock.call_at(s.world.clock.now_ns() + 500_000_000, lambda: s.world.slip(20.0, 0.2))
-    assert s.bench.safety.fault.code == RotationDisagreement.code
-    assert not s.bench.servo.read_condition().torque
 
 
 def test_empty_catalog_is_reported_before_anything_moves(simulated):

@@ -10,7 +10,6 @@ from rig.catalog import Catalog
 from rig.catalog.describing import FEWEST_VIEWS, described
 from rig.core.errors import (
     CameraSettingsDiffer,
-    DeviceFault,
     DeviceSilent,
     RigError,
     RotationDisagreement,
@@ -140,41 +139,6 @@ def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):
             assert len(catalog.resumable("dice").enrollment.present) == stored
 
 
-def test_darkness_causes_retakes_and_ends_the_enrollment_without_losing_views(simulated, catalog):
-    s = simulated()
-    events = []
-    with pytest.raises(ViewRejected, match="too dark") as caught:
-        for event in enroll(s.bench, catalog, "lamp", views=6):
-            events.append(event)
-            if isinstance(event, Accepted) and event.index == 1:
-                s.world.change(light=(0.0, 0.0, 0.0))
-    assert sum(isinstance(e, Rejected) for e in events) == 1 + s.bench.config.view.retakes
-    assert caught.value.exit_code == 6
-    assert catalog.resumable("lamp").enrollment.present == (0, 1)
-    assert torque(s) == 0
-
-
-def test_slipping_platter_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
-    s = simulated()
-    with pytest.raises(RotationDisagreement) as caught:
-        for event in enroll(s.bench, catalog, "lamp", views=18):
-            if isinstance(event, Accepted) and event.index == 3:
-                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-6.0, 0.1))
-    assert caught.value.evidence["difference_deg"] == pytest.approx(6.0, abs=0.7)
-    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2, 3)
-
-
-def test_unplugged_servo_ends_the_plan_with_all_views_stored(simulated, catalog):
-    s = simulated()
-    with pytest.raises(DeviceSilent):
-        for event in enroll(s.bench, catalog, "lamp", views=8):
-            if isinstance(event, Accepted) and event.index == 2:
-                s.bench.servo.bus.port.ser.unplug()
-    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2)
-    with pytest.raises(DeviceSilent):
-        s.bench.close()  # reports that the torque is still on, and closes the other devices
-
-
 def test_torque_that_cannot_be_switched_off_is_an_error_after_an_interruption(simulated):
     s = simulated()
     with pytest.raises(DeviceSilent, match="Torque Enable = 0") as caught, s.bench:
@@ -194,33 +158,6 @@ def test_torque_that_cannot_be_switched_off_is_noted_on_an_earlier_error(simulat
 def servo_of(s):
     """Return the simulated servo of a bench."""
     return s.bench.servo.bus.port.ser._bus._devices[0]
-
-
-def i2c_of(s):
-    return s.operator.devices.i2c
-
-
-@pytest.mark.parametrize("moving", [True, pytest.param(False, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize(
-    ("fail", "error"),
-    [
-        pytest.param(lambda s: i2c_of(s).detach(0x68), DeviceSilent, id="unplugged"),
-        pytest.param(lambda s: i2c_of(s)._devices[0x68].power_cycle(), DeviceFault, id="power-cycled"),
-        pytest.param(lambda s: setattr(i2c_of(s), "stuck", True), DeviceSilent, id="bus stuck"),
-    ],
-)
-def test_failing_gyro_ends_the_plan_with_the_table_stopped_and_torque_off(simulated, catalog, fail, error, moving):
-    s = simulated()
-    with pytest.raises(error):
-        for event in enroll(s.bench, catalog, "lamp", views=8):
-            if moving and isinstance(event, Accepted) and event.index == 2:
-                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: fail(s))
-            if not moving and isinstance(event, Moved) and event.index == 3:
-                fail(s)
-    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2)
-    assert torque(s) == 0
-    s.world.clock.sleep(1.0)
-    assert s.world.shaft()[1] == 0
 
 
 @pytest.mark.parametrize("moving", [True, False])

@@ -96,11 +96,6 @@ def test_unusable_lists_are_rejected(tmp_path, text, words):
     assert words in " ".join(mistakes(tmp_path, text))
 
 
-def test_missing_list_is_rejected(tmp_path):
-    with pytest.raises(UsageError, match="cannot be read"):
-        read_tray(tmp_path / "nothing.csv")
-
-
 class Scripted:
     """An operator with prepared decisions."""
 
@@ -146,14 +141,6 @@ def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog)
     assert actions(events) == [("lamp", "replace")]
     assert sum(isinstance(e, Accepted) for e in events) == 4
     assert len({view.session for view in catalog.object("lamp").views}) == 1
-
-
-def test_operator_can_skip_objects_or_stop(simulated, catalog):
-    s = simulated()
-    operator = Scripted([Choice.SKIP, Choice.CONTINUE, Choice.STOP])
-    events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, operator=operator))
-    assert actions(events) == [("lamp", "skip"), ("dice", "enroll")]
-    assert [o.name for o in catalog.objects()] == ["dice"]
 
 
 def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, catalog):

@@ -204,25 +204,6 @@ def test_supply_loss_in_a_motion_needs_a_new_reference(start, wires):
         assert bench.safety.state is TableState.UNREFERENCED
 
 
-def test_unplugged_cable_ends_the_motion_and_nothing_moves_afterwards(start, wires):
-    with start() as bench:
-        with pytest.raises(DeviceSilent), Turntable(bench) as table:
-            after(wires, 1.2, lambda: wires.bus.detach(wires.device))
-            table.goto(300.0)
-        assert bench.safety.state is TableState.DISCONNECTED
-        wires.world.clock.sleep(1.0)
-        stands_deg, speed_dps = wires.world.shaft()
-        assert speed_dps == 0
-        with pytest.raises(DeviceSilent), Turntable(bench):
-            pass
-        wires.bus.attach(wires.device)
-        wires.world.clock.sleep(5.0)
-        assert wires.world.shaft() == (stands_deg, 0.0)
-        with Turntable(bench) as table:  # asked for, and after a look at who is there
-            assert wires.world.shaft() == (stands_deg, 0.0)
-            assert table.goto(0.0).encoder_deg == at_rest(wires.device, 0.0)
-
-
 @pytest.mark.parametrize("other", [{"model": "xm430_w350"}, {"firmware": 44}])
 def test_different_servo_is_rejected(other, start, wires):
     with start() as bench:
