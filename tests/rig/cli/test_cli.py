@@ -172,15 +172,6 @@ def test_table_rotates_without_a_camera(rig):
     assert rig("identify", *missing).exit_code != 0
 
 
-def test_all_mistakes_in_the_configuration_are_reported_at_once(rig):
-    done = rig("status", "--set", "servo.baud=1", "--set", "view.roy=3", "--json")
-    assert done.exit_code == 3
-    error = json.loads(done.stdout)
-    assert error["code"] == 300
-    assert len(error["evidence"]["mistakes"]) == 2
-    assert error["next_step"]
-
-
 def test_common_options_can_precede_or_follow_the_command(rig):
     before = rig("--seed", "3", "--json", "goto", "30")
     after = rig("goto", "30", "--seed", "3", "--json")
