@@ -43,13 +43,6 @@ def test_login_asks_for_a_token_on_this_computer_too(serve):
     assert "Every user" not in done.stderr
 
 
-@pytest.mark.parametrize("name", ["local", "a\x1b[31m", "\u202egnp"])
-def test_name_of_a_token_that_misleads_is_rejected(serve, name):
-    done, _ = serve("--new-token", name)
-    assert done.exit_code == 3
-    assert "cannot be the name of a token" in done.stderr
-
-
 @pytest.mark.parametrize("content", [None, "no certificate"])
 def test_certificate_that_cannot_be_used_is_reported_before_the_server_starts(tmp_path, content):
     if content is not None:
