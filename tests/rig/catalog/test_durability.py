@@ -65,16 +65,6 @@ def test_process_killed_in_add_loses_only_that_view(tmp_path: Path, die_before: 
     assert_resumes_whole(tmp_path, "mug", {0})
 
 
-@pytest.mark.parametrize("reports", [1, 4, 9])
-def test_process_killed_between_views_keeps_reported_views(tmp_path: Path, reports: int) -> None:
-    child = other_program(tmp_path, "mug", VIEWS)
-    assert child.stdout is not None
-    reported = {int(child.stdout.readline()) for _ in range(reports)}
-    child.kill()
-    reported |= {int(line) for line in child.communicate()[0].splitlines()}
-    assert_resumes_whole(tmp_path, "mug", reported)
-
-
 def test_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
     fsync, replace = os.fsync, os.replace

@@ -2,9 +2,7 @@
 
 import csv
 import json
-import os
 import shutil
-import signal
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,7 +20,7 @@ from rig.catalog.upkeep import collect_garbage
 from rig.catalog.verify import CatalogProblem, verify
 from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectNotFound, UsageError
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import fill, finished, image, new_result, other_program, sql, without_waiting
+from tests.rig.catalog.catalog_samples import fill, finished, image, new_result, sql, without_waiting
 
 
 @pytest.fixture(scope="module")
@@ -179,17 +177,6 @@ def test_verify_finds_a_changed_image(catalog: Catalog) -> None:
     assert (finding.problem, finding.path) == (CatalogProblem.CHANGED_IMAGE, path)
 
 
-@pytest.mark.parametrize("die_before", [*(pytest.param(n, marks=pytest.mark.nightly) for n in (1, 2, 3, 4, 5, 7)), 6])
-def test_process_killed_while_recording_leaves_nothing_half_written(tmp_path: Path, die_before: int) -> None:
-    program = other_program(tmp_path / "catalog", "-", 0, die_before)
-    assert program.communicate()[0] == "answered\n"
-    with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as catalog:
-        killed = program.returncode == -signal.SIGKILL
-        assert numbers(catalog) == ([1] if killed else [1, 2])
-        record(catalog, new_result(), image(3))
-        assert finished(verify(catalog, jobs=1)).findings == ()
-
-
 def test_table_has_a_row_for_each_result(catalog: Catalog, tmp_path: Path) -> None:
     correct(catalog, 1, sample="=1+1", reason='a "quoted" reason')
     results = find_results(catalog)
@@ -207,15 +194,3 @@ def test_table_has_a_row_for_each_result(catalog: Catalog, tmp_path: Path) -> No
     assert (loaded[0]["sample"], loaded[0]["answered_sample"], rows[0]["not_enrolled"]) == ("=1+1", "S-1", "0.003")
     parquet = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "a.parquet").to_pylist()
     assert parquet == wanted
-
-
-def test_full_disk_is_reported_and_earlier_results_are_safe(catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_: int) -> None:
-        raise OSError(28, os.strerror(28))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fail)
-        with pytest.raises(CatalogError, match=r"full.*earlier ones are safe"):
-            record(catalog, new_result(), image(5))
-    assert numbers(catalog) == [1, 2, 3]
-    assert record(catalog, new_result(), image(5)) == 4

@@ -63,18 +63,6 @@ class TestAllOrNothing:
         assert run_import(catalog, photographs()).views == 12
         assert finished(verify(catalog)).findings == ()
 
-    def test_full_disk_ends_an_import(
-        self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def full(*_: object, **__: object) -> str:
-            raise OSError(28, "No space left on device")
-
-        catalog = open_catalog("catalog")
-        monkeypatch.setattr("rig.catalog.images.Images.put", full)
-        with pytest.raises(CatalogError, match="is full"):
-            run_import(catalog, photographs())
-        assert untouched(catalog)
-
     def test_import_notices_an_object_of_another_process_and_keeps_replaced_enrollments(
         self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog
     ) -> None:
