@@ -1,6 +1,7 @@
 """`rig calibrate` on the command line."""
 
 import json
+from dataclasses import replace
 from datetime import timedelta
 from html import escape, unescape
 from math import sqrt
@@ -13,12 +14,13 @@ from typer.testing import CliRunner
 from calibration import camera_model, encoder, gyro_rotation, imu_mounting, table_axis
 from calibration.procedures import Backlash, Encoder, GyroRotation, GyroScale, ImuMounting
 from calibration.report import plots
-from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
+from rig.calibrations import CalibrationResult, CalibrationStore
 from rig.catalog import log
 from rig.cli.main import app
 from rig.core.clock import SystemClock
 from rig.views.charuco_board import CharucoBoard
 from tests.calibration.drawn import measured, moves
+from tests.rig.calibrations.test_calibrations import RESULT
 
 CONFIG = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
 
@@ -194,22 +196,9 @@ def test_board_is_printed_without_a_bench(rig, tmp_path):
 
 
 def store(tmp_path, days: float, **device: str) -> None:
-    CalibrationStore(tmp_path / "calibrations" / "sim").add(
-        CalibrationResult(
-            name=encoder.NAME,
-            estimates={"cos1": Estimate(0.0, (), "°")},
-            residual=None,
-            limit=None,
-            residual_unit="°",
-            rejections=(),
-            when_utc=SystemClock().utc() - timedelta(days=days),
-            valid_days=30.0,
-            reference="",
-            operator="",
-            device=device,
-            evidence={"steps": [], "revolution_deg": 360.0},
-        )
-    )
+    when_utc = SystemClock().utc() - timedelta(days=days)
+    result = replace(RESULT, name=encoder.NAME, when_utc=when_utc, valid_days=30.0, device=device)
+    CalibrationStore(tmp_path / "calibrations" / "sim").add(result)
 
 
 @pytest.mark.parametrize(

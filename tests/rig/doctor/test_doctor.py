@@ -2,12 +2,13 @@
 
 import sqlite3
 import threading
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
-from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore, Estimate
+from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, DeviceNotFound, DeviceSilent
@@ -17,6 +18,7 @@ from rig.doctor.device_scan import DeviceScan
 from rig.doctor.examination import Check, run_checks
 from rig.doctor.finding import FindingCode, Severity
 from sim.faults import Fault, Faults, fault_kinds
+from tests.rig.calibrations.test_calibrations import RESULT
 from tests.rig.catalog.catalog_samples import fill
 from tests.rig.doctor.doctor_parts import unopened
 
@@ -290,20 +292,8 @@ def test_catalog_with_orphaned_rows_is_damaged(bench):
 
 
 def result(bench, days_ago: float, valid_days: float | None = None, **device: object) -> CalibrationResult:
-    return CalibrationResult(
-        name="imu.scale",
-        estimates={"scale": Estimate(1.01, (), "")},
-        residual=0.1,
-        limit=0.2,
-        residual_unit="°",
-        rejections=(),
-        when_utc=bench.context.computer.clock.utc() - timedelta(days=days_ago),
-        reference="",
-        operator="",
-        device=device,
-        evidence={},
-        valid_days=valid_days,
-    )
+    when_utc = bench.context.computer.clock.utc() - timedelta(days=days_ago)
+    return replace(RESULT, when_utc=when_utc, device=device, valid_days=valid_days)
 
 
 def test_delay_inside_the_camera_is_reported_from_its_calibration():
