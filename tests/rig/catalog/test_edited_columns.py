@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rig.catalog.facts import Derived, Row
+from rig.catalog.facts import Derived, Enrollment, Entry, Row, Session, View, digested
 from rig.catalog.verify import verify
 from rig.core.errors import RigError
 from tests.rig.catalog.catalog_samples import finished
@@ -53,6 +53,17 @@ def literal(value: object) -> str:
     if isinstance(value, bytes):
         return f"x'{value.hex()}'"
     return "'" + value.replace("'", "''") + "'" if isinstance(value, str) else repr(value)
+
+
+def test_a_digest_covers_every_column_that_means_the_same_in_all_catalogs() -> None:
+    covered = {table: {column.name for _, column in digested(table)} for table in (Enrollment, Session, View, Entry)}
+    left_out = {table.__tablename__: {*table.__table__.columns.keys()} - names for table, names in covered.items()}
+    assert left_out == {
+        "enrollments": {"id", "object_id", "digest"},
+        "sessions": {"enrollment_id", "digest"},
+        "views": {"id", "enrollment_id", "digest"},
+        "log": {"digest"},
+    }
 
 
 @pytest.mark.parametrize("count", [12, pytest.param(200, marks=[pytest.mark.nightly, pytest.mark.timeout(1200)])])

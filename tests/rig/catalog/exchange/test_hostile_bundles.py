@@ -113,7 +113,7 @@ class TestHostileBundles:
             ("PRAGMA application_id = 2", "another program"),
         ],
     )
-    @pytest.mark.parametrize("sealed", [True, False])
+    @pytest.mark.parametrize("sealed", [True, pytest.param(False, marks=pytest.mark.nightly)])
     def test_impossible_rows_are_rejected(
         self, bundle: Path, open_catalog: OpenCatalog, statement: str, words: str, sealed: bool
     ) -> None:
