@@ -69,7 +69,7 @@ def test_version_mismatch_names_the_side_to_update(version, step):
     head.close()
 
 
-def test_port_without_head_raises_device_not_found(opened):
+def test_port_without_head_raises_device_not_found():
     class Deaf:
         baudrate, in_waiting = BAUD, 0
 

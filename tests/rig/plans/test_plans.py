@@ -178,9 +178,11 @@ def test_supply_dip_of_the_servo_ends_the_plan_and_nothing_moves_afterwards(simu
     assert s.world.shaft()[0] == before
 
 
-@pytest.mark.parametrize("kind", [Started, Moved, Rejected, Accepted])
-@pytest.mark.parametrize("end", ["closed", "forgotten"])
-def test_plan_that_is_closed_at_any_event_switches_the_torque_off(simulated, catalog, kind, end):
+@pytest.mark.parametrize(
+    ("end", "kind"),
+    [*(("closed", kind) for kind in (Started, Moved, Rejected, Accepted)), ("forgotten", Accepted)],
+)
+def test_plan_that_is_closed_at_any_event_switches_the_torque_off(simulated, catalog, end, kind):
     s = simulated()
     if kind is Rejected:
         s.world.change(light=(0.0, 0.0, 0.0))

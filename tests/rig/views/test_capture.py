@@ -181,11 +181,10 @@ def test_view_is_accepted_after_a_pause_longer_than_the_gyro_fifo(on_the_table):
     assert attempts[-1].accepted
 
 
-@pytest.mark.parametrize("reason", RejectReason)
-def test_every_reason_has_a_text_and_old_texts_stay(reason, on_the_table):
+def test_every_reason_has_a_text_and_old_texts_stay(on_the_table):
     in_motion = MotionEvidence(0, angle_deg=40.0, angle_sigma_deg=0.3, speed_dps=60.0, smear_px=3.0, residual_deg=0.1)
     evidence = replace(attempts_of(*on_the_table)[0].evidence, motion=in_motion)
-    assert rejection_text(reason, evidence) not in ("", str(reason))
+    assert {*RejectReason, ""}.isdisjoint(rejection_text(reason, evidence) for reason in RejectReason)
     assert rejection_text("blurred (sharpness 2.0 < 3)", evidence) == "blurred (sharpness 2.0 < 3)"
 
 
