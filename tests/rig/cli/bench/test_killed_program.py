@@ -254,11 +254,12 @@ def test_guardian_switches_the_torque_off_of_each_command_that_moves(running_sim
     def torque() -> bool:
         return send_command(running_sim_bench, "status")["world"]["torque"]
 
-    until(lambda: torque() or process.poll() is not None)
+    # Each answer takes time of the simulated bench.
+    until(lambda: torque() or process.poll() is not None, every_s=0.1)
     assert process.poll() is None, process.stdout.read()
     process.kill()
     process.communicate()
-    until(lambda: not torque())
+    until(lambda: not torque(), every_s=0.1)
     assert not (tmp_path / "here" / "imported").exists()
 
 

@@ -98,15 +98,6 @@ def test_interrupted_check_changes_nothing(two: Rig, monkeypatch: pytest.MonkeyP
     assert "torque" not in stopped.stderr
 
 
-def test_identify_reports_another_region(rig: Rig) -> None:
-    assert rig("enroll", "dice", "--views", "4").exit_code == 0
-    moved = ("--set", "view.roi=[45, 0, 230, 240]", "--set", "bench.sim.object=dice", "--set", "identify.max_views=2")
-    note = rig("identify", *moved).stderr
-    assert "now it is [45, 0, 230, 240]" in note
-    assert "rig config set view.roi '[40, 0, 240, 240]'" in note
-    assert "view.roi" not in rig("identify", *moved[2:]).stderr
-
-
 def test_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:
     folder = photographs(tmp_path / "in", "mug")
     (folder / "mug__5.png").write_bytes(b"x")

@@ -19,6 +19,7 @@ from rig.search.model import CurrentModel
 from rig.views.object_presence import TableWatcher
 from sim.bench import ShelfOperator
 from sim.objects.shelf import shelf
+from tests.rig.catalog.catalog_samples import fill
 
 
 def in_json(done):
@@ -107,6 +108,14 @@ def test_closed_pipe_ends_the_command_without_an_error(enrolled):
     assert "Error" not in done.stderr
 
 
+def test_region_that_differs_from_that_of_the_enrollment_is_reported(rig):
+    moved = ("--set", "view.roi=[45, 0, 230, 240]", "--set", "bench.sim.object=dice", "--set", "identify.max_views=2")
+    note = rig("identify", *moved).stderr
+    assert "now it is [45, 0, 230, 240]" in note
+    assert "rig config set view.roi '[40, 0, 240, 240]'" in note
+    assert "view.roi" not in rig("identify", *moved[2:]).stderr
+
+
 def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
     """The model is loaded again only if the catalog has changed."""
     folder, _ = enrolled
@@ -114,7 +123,8 @@ def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
         model = CurrentModel(catalog)
         before = model()
         assert model() is before
-        assert rig("enroll", "amphora", "--views", "4").exit_code == 0
+        with Catalog.open(folder / "catalog", clock=SystemClock()) as other:
+            fill(other, "amphora", 4)
         assert "amphora" not in before.views.object_names
         assert "amphora" in model().views.object_names
 
