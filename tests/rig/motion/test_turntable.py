@@ -8,6 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rig.core.errors import FaultLatched, LimitExceeded, MotionTimeout, NoProgress, NotReady, Stalled
+from rig.core.json_form import plain
 from rig.devices.servo import MotionProfile
 from rig.motion.move import motion_seconds
 from rig.motion.trajectory import TrajectoryRecorder
