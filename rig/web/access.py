@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import timedelta
+from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,7 @@ from typing import Any, Final
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import ConfigError, LeaseHeld, LoginRequired, StateNotStored, os_errors_as
+from rig.core.errors import ConfigError, LeaseHeld, LoginRequired, StateNotStored, UsageError, os_errors_as
 from rig.core.files import read, write
 from rig.core.next_steps import Do
 
@@ -87,31 +87,45 @@ class Tokens:
         self._known: list[StoredToken] = []
         self._read_at: tuple[int, int, int] | None = None
         self._damage: ConfigError | None = None
+        self._changing = threading.Lock()
+        self._used: dict[str, datetime] = {}
+        """When a token was valid for the last time, by its hash."""
 
-    def new(self, name: str, role: Role, days: float | None = None) -> str:
-        """Make a token, store its hash, and return it; a token of the same name is replaced.
+    def new(self, name: str, role: Role, days: float | None = None, *, replace: bool = True) -> str:
+        """Make a token, store its hash, and return it.
 
-        Raises `ConfigError`: the name cannot be used, or the file is damaged. `StateNotStored`: the file cannot be
-        written.
+        Raises `UsageError`: the name cannot be used, or a token has it and ``replace`` is False. `ConfigError`: the
+        file is damaged. `StateNotStored`: it cannot be written.
         """
         if not 0 < len(name) <= MAX_NAME or not name.isprintable() or name.strip() != name or name.casefold() == LOCAL:
-            raise ConfigError(
+            raise UsageError(
                 f"{name!r} cannot be the name of a token.",
                 next_step=f"Use 1 to {MAX_NAME} characters that can be printed, without outer spaces, but not {LOCAL}.",
             )
         token, now = new_token(), self._clock.utc()
         expires = None if days is None else now + timedelta(days=days)
         stored = StoredToken(name=name, role=role, sha256=_hash(token), created_utc=now, expires_utc=expires)
-        self._store([*(other for other in self.stored() if other.name != name), stored])
+        with self._changing:
+            others = [other for other in self.stored() if other.name != name]
+            if not replace and len(others) < len(self._known):
+                raise UsageError(
+                    f"There is a token {name} already.", next_step="Choose another name, or revoke that token first."
+                )
+            self._store([*others, stored])
         return token
 
     def remove(self, name: str) -> bool:
         """Remove a token, and return whether it existed."""
-        before = self.stored()
-        after = [token for token in before if token.name != name]
-        if removed := len(after) != len(before):
-            self._store(after)
+        with self._changing:
+            before = self.stored()
+            after = [token for token in before if token.name != name]
+            if removed := len(after) != len(before):
+                self._store(after)
         return removed
+
+    def used_utc(self, token: StoredToken) -> datetime | None:
+        """Return when a token was used last; None if this server has not seen it."""
+        return self._used.get(token.sha256)
 
     def stored(self) -> list[StoredToken]:
         """Return the stored tokens. Raises `ConfigError` if their file is damaged."""
@@ -131,6 +145,7 @@ class Tokens:
             raise self._damage
         if found is None or (found.expires_utc is not None and found.expires_utc <= self._clock.utc()):
             return None
+        self._used[found.sha256] = self._clock.utc()
         return found
 
     def _read(self) -> None:

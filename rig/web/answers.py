@@ -27,6 +27,9 @@ def time_text(at: datetime) -> str:
     return at.isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
+Time = Annotated[datetime, PlainSerializer(time_text, when_used="json")]
+
+
 class ListOf(BaseModel, Generic[Row]):
     """A page of a list; ``next`` is the value of ``after`` for the next page, or null."""
 
@@ -44,10 +47,27 @@ class Health(BaseModel):
 
 
 class Login(BaseModel):
-    """Who is logged in."""
+    """Who is logged in: the name and the role of the token."""
 
     name: str
     role: Role
+
+
+class TokenRow(Login):
+    """A token without its secret.
+
+    ``expires_utc`` is null if it is always valid, ``used_utc`` if it was not used since the server started.
+    """
+
+    created_utc: Time
+    expires_utc: Time | None
+    used_utc: Time | None
+
+
+class NewToken(Login):
+    """A new token. No other answer has its secret, ``token``."""
+
+    token: str
 
 
 class LeaseHolder(BaseModel):
@@ -184,9 +204,6 @@ class Move(BaseModel):
     gyro_dps: list[float]
 
 
-Time = Annotated[datetime, PlainSerializer(time_text, when_used="json")]
-
-
 class ObjectRow(BaseModel):
     """An object, as `rig.catalog.ObjectSummary`."""
 
@@ -267,7 +284,7 @@ class ResultDetails(ResultRow):
 
 
 class Deleted(BaseModel):
-    """The name of an object that was deleted."""
+    """The name of what was deleted."""
 
     deleted: str
 

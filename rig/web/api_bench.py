@@ -9,10 +9,12 @@ from typing import Annotated, Any, Final
 
 from fastapi import Header, Request, Response, WebSocket, WebSocketDisconnect
 
-from rig.core.errors import JobNotFound, TooManyListeners
+from rig.core.errors import Forbidden, JobNotFound, TooManyListeners
+from rig.core.next_steps import Do
 from rig.motion.turntable import check_angle
-from rig.web.access import Role
+from rig.web.access import LOCAL, Person, Role
 from rig.web.answers import (
+    Deleted,
     EventStream,
     Health,
     JobEvents,
@@ -23,26 +25,27 @@ from rig.web.answers import (
     Login,
     Me,
     Move,
+    NewToken,
     OtherBench,
     ShelfState,
     Status,
     Stopped,
     Svg,
+    TokenRow,
 )
 from rig.web.benches import OtherBenches
 from rig.web.hub import MAX_LISTENERS
-from rig.web.requests import AnswerBody, ByHand, GotoRequest, Job, JobRequest, LeaseBody, LoginBody
+from rig.web.requests import AnswerBody, ByHand, GotoRequest, Job, JobRequest, JobState, LeaseBody, LoginBody, TokenBody
 from rig.web.server import (
     API,
     COOKIE,
+    Manager,
     OperatorPerson,
     Page,
     Proposer,
     Routes,
     Server,
     Watcher,
-    require_operate,
-    schemes,
 )
 
 IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
@@ -79,11 +82,9 @@ def add_access(routes: Routes, server: Server) -> None:
         mine = server.lease.is_held_by(person)
         return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
 
-    # It has no role of its group: a request of an operator renews the lease, but does not take it over.
-    @routes.public.post("/lease", tags=["access"], response_model=LeaseState, dependencies=schemes(Role.OPERATE))
-    def take_lease(body: LeaseBody, person: Watcher) -> Any:
+    @routes.manage.post("/lease", tags=["access"], response_model=LeaseState)
+    def take_lease(body: LeaseBody, person: Manager) -> Any:
         """Take or renew the lease."""
-        require_operate(person)
         server.lease.take(person, force=body.force)
         return server.lease.as_json()
 
@@ -92,6 +93,42 @@ def add_access(routes: Routes, server: Server) -> None:
         """Give the lease back."""
         server.lease.release(person)
         return server.lease.as_json()
+
+    tokens = server.sessions.tokens
+
+    @routes.manage.get("/tokens", tags=["access"])
+    def list_tokens() -> ListOf[TokenRow]:
+        """List the tokens, without their secrets."""
+        rows = [TokenRow(**dict(one), used_utc=tokens.used_utc(one)) for one in tokens.stored()]
+        return ListOf(items=rows, total=len(rows), next=None)
+
+    @routes.manage.post("/tokens", tags=["access"], status_code=201)
+    def make_token(body: TokenBody, person: Manager) -> NewToken:
+        """Make a token. It is in this answer only."""
+        _require_login(person, body.name)
+        token = tokens.new(body.name, body.role, body.days, replace=False)
+        return NewToken(name=body.name, role=body.role, token=token)
+
+    @routes.manage.delete("/tokens/{name:path}", tags=["access"])
+    def revoke_token(name: str, person: Manager) -> Deleted:
+        """Revoke a token. Its logins and its open streams end, and its lease."""
+        _require_login(person, name)
+        if not tokens.remove(name):
+            raise JobNotFound("There is no token with that name.", next_step="Choose one of GET /api/v1/tokens.")
+        server.hub.wake()
+        holder = server.lease.holder
+        if holder is not None and holder.name == name:
+            server.lease.release(holder)
+        return Deleted(deleted=name)
+
+
+def _require_login(person: Person, name: str) -> None:
+    """Raise `Forbidden` for a user of this computer without a token: a later server may want one from each of them."""
+    if person.name == LOCAL:
+        raise Forbidden(
+            "A server that needs no login does not change tokens.",
+            next_step=("At a terminal of the bench's computer:", Do.NEW_TOKEN(name=name)),
+        )
 
 
 def add_bench(routes: Routes, server: Server) -> None:
@@ -176,9 +213,9 @@ async def _send_events(server: Server, socket: WebSocket) -> None:
 
 def add_jobs(routes: Routes, server: Server) -> None:
     @routes.watch.get("/jobs", tags=["jobs"], response_model=ListOf[Job])
-    def list_jobs(page: Page) -> Response:
-        """List the jobs, the newest first."""
-        return page.of(server.remote.call("jobs"), "id")
+    def list_jobs(page: Page, state: JobState | None = None) -> Response:
+        """List the jobs, or those in one state, the newest first."""
+        return page.of([job for job in server.remote.call("jobs") if state in (None, job["state"])], "id")
 
     @routes.propose.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
     def submit_job(

@@ -41,7 +41,6 @@ def create_app(server: Server) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
     )
     app.state.server = server
-    # Three groups of routes by what a person may do: no login, watch, operate.
     routes = Routes()
     for add in (
         add_access,
@@ -55,7 +54,7 @@ def create_app(server: Server) -> FastAPI:
         add_records,
     ):
         add(routes, server)
-    for router in (routes.public, routes.watch, routes.propose, routes.operate):
+    for router in vars(routes).values():
         app.include_router(router, prefix=API, responses=_ERRORS)
     app.include_router(pages(server.setup.bench, with_others=bool(server.setup.config.serve.benches)))
     add_reference(app)

@@ -11,6 +11,7 @@ from rig.events.events import Enrolled, Identified
 from rig.jobs.doctor import Examined
 from rig.jobs.table import Acknowledged, TableAngle
 from rig.plans.operator import Choice
+from rig.web.access import MAX_NAME, Role
 
 
 class _Request(BaseModel):
@@ -243,6 +244,14 @@ class LoginBody(_Request):
     """A token."""
 
     token: Annotated[str, Field(max_length=200)]
+
+
+class TokenBody(_Request):
+    """A token to be made."""
+
+    name: Annotated[str, Field(max_length=MAX_NAME, description="of the person or program that gets it")]
+    role: Role
+    days: Annotated[float | None, Field(ge=0.01, le=3650, description="how long it is valid; default: always")] = None
 
 
 class LeaseBody(_Request):

@@ -141,6 +141,12 @@ async def operator(request: Request, person: Annotated[Person, Depends(watcher)]
     return person
 
 
+async def manager(person: Annotated[Person, Depends(watcher)]) -> Person:
+    """Return the sender of the request, who may operate, but need not have the lease. Raises `Forbidden`."""
+    require_operate(person)
+    return person
+
+
 async def proposer(request: Request, person: Annotated[Person, Depends(watcher)]) -> Person:
     """Return the sender, who may propose jobs, or is an operator with the lease. Raises as `operator`."""
     return person if person.role is Role.PROPOSE else await operator(request, person)
@@ -168,6 +174,7 @@ async def long_work(work: Callable[[], Result]) -> Result:
 
 Watcher = Annotated[Person, Depends(watcher)]
 Proposer = Annotated[Person, Depends(proposer)]
+Manager = Annotated[Person, Depends(manager)]
 OperatorPerson = Annotated[Person, Depends(operator)]
 
 
@@ -182,12 +189,16 @@ def schemes(role: Role) -> list[Any]:
 
 
 class Routes:
-    """The routes of the API by the right that they need: none, to watch, to propose a job, or to operate the bench."""
+    """The routes of the API by the right that they need: none, to watch, to propose a job, or to operate the bench.
+
+    Those to ``manage`` need the role to operate, but not the lease, which another operator may have.
+    """
 
     def __init__(self) -> None:
         self.public = APIRouter()
         self.watch = APIRouter(dependencies=[Depends(watcher), *schemes(Role.WATCH)])
         self.propose = APIRouter(dependencies=[Depends(proposer), *schemes(Role.PROPOSE)])
+        self.manage = APIRouter(dependencies=[Depends(manager), *schemes(Role.OPERATE)])
         self.operate = APIRouter(dependencies=[Depends(operator), *schemes(Role.OPERATE)])
 
 

@@ -1,5 +1,5 @@
-// Calibrations, log and settings: each part runs on the page that has its element.
-import { $, act, canOperate, counted, dayOf, followJob, get, h, number, on, pager, request, showJob, start, submit, table, timeOf, toast, when, whoami } from "./rig.js";
+// Calibrations, log, settings and tokens: each part runs on the page that has its element.
+import { $, act, ask, at, canOperate, counted, dayOf, followJob, get, h, number, on, pager, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
 
 // -- calibrations -----------------------------------------------------------------------------------------------------------
 
@@ -75,6 +75,36 @@ if ($("log")) {
   on("hello", () => act(log));
 }
 
+// -- tokens -------------------------------------------------------------------------------------------------------------------
+
+const ROLES = { watch: "only watch, and press STOP", propose: "watch, and propose jobs", operate: "operate the bench" };
+
+async function loadTokens() {
+  const { items } = await get("/tokens");
+  const revoke = async ({ name }) => {
+    const words = name === whoami().name ? "You are logged in with it, and will be logged out." : "Who uses it is logged out at once, and cannot log in again.";
+    if ((await ask(`Revoke the token ${name}?`, h("p", {}, words), [["revoke", "Revoke", "danger"]])) !== "revoke") return;
+    await act(async () => { await request("DELETE", `/tokens/${at(name)}`); await loadTokens(); });
+  };
+  table($("tokens"), ["Name", "May", "Made", "Valid until", "Last used", ""], items.map((one) => [
+    one.name,
+    ROLES[one.role],
+    dayOf(one.created_utc),
+    one.expires_utc ? when(one.expires_utc) : "always",
+    one.used_utc ? when(one.used_utc) : "not since the server started",
+    whoami().name === "local" ? "" : h("button", { class: "quiet", "aria-label": `Revoke ${one.name}`, onclick: () => revoke(one) }, "Revoke"),
+  ]));
+}
+
+/** Show a new token, which the server does not show again. */
+function showToken({ name, token }) {
+  const field = h("input", { value: token, readonly: true, "aria-label": `Token ${name}`, onfocus: () => field.select() });
+  const copy = navigator.clipboard && h("button", { onclick: () => act(() => navigator.clipboard.writeText(token)) }, "Copy"); // only with TLS, or on this computer
+  const done = h("button", { class: "quiet", onclick: () => $("made").replaceChildren() }, "Done");
+  $("made").replaceChildren(h("div", { class: "question fields" }, h("p", {}, `This is the token ${name}. It is not shown again: enter it now where it is needed, and keep it secret.`), field, h("div", { class: "row" }, ...[copy, done].filter(Boolean))));
+  field.focus();
+}
+
 // -- settings -----------------------------------------------------------------------------------------------------------------
 
 const TITLES = { servo: "Servo", table: "Table", mark: "Home mark", safety: "Safety", imu: "Gyro", head: "Rig head", camera: "Camera", camera_time: "Time of the camera", view: "Quality of views", catalog: "Catalog", enroll: "Enroll", identify: "Identify" };
@@ -92,6 +122,14 @@ function typed(field, key) {
 }
 
 if ($("settings")) {
+  $("make-token").addEventListener("submit", (event) => {
+    event.preventDefault();
+    act(async () => {
+      showToken(await request("POST", "/tokens", valuesOf($("make-token"))));
+      $("make-token").reset();
+      await loadTokens();
+    });
+  });
   let keys = [];
   const save = (key, value) => act(async () => {
     const before = key.saved ?? key.value;
@@ -133,7 +171,14 @@ if ($("settings")) {
   $("search").addEventListener("input", render);
   $("changed").addEventListener("change", render);
   on("hello", () => act(load));
-  on("me", () => { $("you").textContent = `User ${whoami().name}. You may ${whoami().role === "operate" ? "operate the bench" : "only watch"}.`; $("logout").hidden = whoami().name === "local"; });
+  on("me", () => {
+    const { name, role } = whoami();
+    $("you").textContent = `User ${name}. You may ${ROLES[role]}.`;
+    $("logout").hidden = name === "local";
+    $("tokens-section").hidden = !canOperate();
+    $("make-token").hidden = name === "local"; // then also the other users of this computer need no token
+    if (canOperate()) act(loadTokens);
+  });
   $("logout").addEventListener("click", () => act(async () => { await request("POST", "/logout"); location.assign("/login"); }));
 }
 start();

@@ -368,10 +368,10 @@ on("stop", ({ ended, torque_off: torqueOff }) => {
 
 // -- a job -------------------------------------------------------------------------------------------------------------
 
-const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", reference: "Set the angle", doctor: "Check the bench", calibrate: "Calibrate" };
+const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", reference: "Set the angle", doctor: "Check the bench", calibrate: "Calibrate", camera: "Set the camera" };
 const ENDED = ["done", "failed", "cancelled", "interrupted"];
 const ACTIVE = ["running", "paused", "waiting"];
-const STATES = { queued: "waits for the bench", waiting: "waits for you", failed: "not finished", cancelled: "stopped" };
+const STATES = { proposed: "waits for an approval", queued: "waits for the bench", waiting: "waits for you", failed: "not finished", cancelled: "stopped" };
 const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "Stop" };
 export const isEnded = (job) => ENDED.includes(job.state);
 
@@ -380,6 +380,37 @@ export function jobTitle(job) {
   const what = request_.name || (request_.angle_deg !== undefined ? `to ${number(request_.angle_deg)}°` : "");
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
 }
+
+// -- proposed jobs: every page shows them, and an operator approves or rejects them ---------------------------------------
+
+const proposed = new Map();
+
+/** Return all that the request of a job says besides its title. */
+function jobDetails({ request: { kind: _kind, name: _name, angle_deg: _angle, ...others } }) {
+  const words = (value) => (Array.isArray(value) ? value.map((one) => one.name ?? one).join(", ") : value);
+  return Object.entries(others).filter(([, value]) => value !== null && value !== false).map(([key, value]) => `${key.replaceAll("_", " ")}${value === true ? "" : `: ${words(value)}`}`).join("; ");
+}
+
+function showProposals() {
+  $("proposals").replaceChildren(...[...proposed.values()].map((job) => {
+    const details = jobDetails(job);
+    const post = (what) => () => act(() => request("POST", `/jobs/${job.id}/${what}`));
+    const buttons = [h("button", { onclick: post("approve") }, "Approve"), " ", h("button", { class: "quiet", onclick: post("cancel") }, "Reject")];
+    return h("p", {}, h("strong", {}, job.operator), ` proposes: ${jobTitle(job)}${details && ` (${details})`}. `, ...(canOperate() ? buttons : ["It waits for an operator."]));
+  }));
+}
+
+on("job", (job) => {
+  if (job.state === "proposed") proposed.set(job.id, job);
+  if (job.state === "proposed" || proposed.delete(job.id)) showProposals();
+});
+on("hello", () => act(async () => {
+  const { items } = await get("/jobs?state=proposed");
+  proposed.clear();
+  for (const job of items.reverse()) proposed.set(job.id, job);
+  showProposals();
+}));
+on("me", showProposals);
 
 /** Show a job in a box: progress, question, buttons and, unless the page shows it elsewhere, the outcome. */
 export function showJob(box, job, withOutcome = true) {
@@ -397,7 +428,7 @@ export function showJob(box, job, withOutcome = true) {
     const buttons = job.question.choices.map((choice) => h("button", { class: choice === "continue" ? "" : "quiet", onclick: () => post("answer", sample && choice === "continue" ? { choice, sample: sample.value || null } : { choice })() }, CHOICES[choice]));
     parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), sample, h("p", {}, ...nextSteps(job.question.steps)), h("div", { class: "row" }, ...buttons)));
   }
-  if (!isEnded(job)) {
+  if (!isEnded(job) && job.state !== "proposed") {
     parts.push(
       h("div", { class: "row" },
         job.state === "running" && h("button", { class: "quiet", onclick: post("pause") }, "Pause"),
@@ -446,8 +477,10 @@ export function followJob(kinds, { begin, event, render }) {
     waiting = null;
     render(shown, true);
   }
+  // A proposed job is shown when it is approved; one that was cancelled before its start has done nothing.
+  const counts = (job) => kinds.includes(job.request.kind) && job.state !== "proposed" && (job.state !== "cancelled" || job.started_utc || job.id === shown?.id);
   function take(job) {
-    if (!kinds.includes(job.request.kind)) return;
+    if (!counts(job)) return;
     if (shown?.id === job.id) {
       shown = job;
       render(job, !waiting);
@@ -455,8 +488,8 @@ export function followJob(kinds, { begin, event, render }) {
   }
   on("job", take);
   on("hello", () => act(async () => {
-    const newest = newestOf((await loadJobs()).filter((job) => kinds.includes(job.request.kind)));
     shown = null;
+    const newest = newestOf((await loadJobs()).filter(counts));
     if (newest) await open(newest);
   }));
   on("plan", (one, id) => {

@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from rig.core.errors import ConfigError, LeaseHeld, LoginRequired
+from rig.core.errors import ConfigError, LeaseHeld, LoginRequired, UsageError
 from rig.web.access import LEASE_S, SESSION_S, Lease, Person, Role, Sessions, Tokens
 from sim.clock import VirtualClock
 
@@ -83,7 +83,7 @@ def test_damaged_tokens_change_nothing_for_those_who_have_one(tmp_path, sessions
     "name", ["a\x07b", "a\nb", "\u202eadmin", "\u200bx", " a", "a ", "", "x" * 51, "local", "LOCAL"]
 )
 def test_name_of_a_token_can_be_read_and_is_not_that_of_the_computer(sessions, name):
-    with pytest.raises(ConfigError):
+    with pytest.raises(UsageError):
         sessions.tokens.new(name, Role.WATCH)
 
 

@@ -27,6 +27,10 @@ def headers(bench, name, role):
     return {"Authorization": f"Bearer {bench.server.sessions.tokens.new(name, role)}"}
 
 
+def waiting(bench, who):
+    return bench.client.get(f"{API}?state=proposed", headers=who).json()["items"]
+
+
 def end_of(bench, job_id):
     bench.wait(job_id)
     return bench.worker.queue.job(job_id).state
@@ -43,12 +47,14 @@ def test_proposed_job_starts_after_an_operator_approves_it(bench, heard):
     for forbidden in ("approve", "cancel"):
         assert bench.client.post(f"{path}/{forbidden}", headers=agent).status_code == 403
     assert bench.server.lease.holder is None
+    assert [one["id"] for one in waiting(bench, agent)] == [proposed["id"]]
     # A job of an operator overtakes it.
     own = bench.client.post(API, json={"kind": "home"}, headers=person).json()
     assert end_of(bench, own["id"]) == "done"
     assert bench.worker.queue.job(proposed["id"]).state == "proposed"
     approved = bench.client.post(f"{path}/approve", headers=person).json()
     assert approved["approved_by"] == "ana"
+    assert waiting(bench, agent) == []
     assert end_of(bench, proposed["id"]) == "done"
     assert bench.client.post(f"{path}/approve", headers=person).status_code == 409
     ended()
