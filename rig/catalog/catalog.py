@@ -409,14 +409,7 @@ class OpenEnrollment:
                 f"{self.object_name!r}.",
                 next_step="Start a new enrollment with a larger plan.",
             )
-        check_view(view)
-        clock, database = self.catalog.clock, self.catalog.database
-        png = images.encode(image_bgr) if encoded is None else encoded.result()
-        if view.captured_ns is not None:
-            age_ns = clock.now_ns() - view.captured_ns
-            view.captured_utc = clock.utc() - timedelta(microseconds=age_ns // 1000)
-        with database.catalog_errors():
-            view.image, view.image_bytes = database.images.put(png), len(png)
+        png, database = store_image(self.catalog, view, image_bgr, encoded), self.catalog.database
         with database.write() as transaction:
             self._check_in_progress(transaction)
             if view.index not in self._missing(transaction):
@@ -512,6 +505,21 @@ class OpenEnrollment:
                 f"The enrollment of {self.object_name!r} is {status or 'gone'}, not in progress.",
                 next_step="Start a new one.",
             )
+
+
+def store_image(
+    catalog: Catalog, view: View, image_bgr: NDArray[np.uint8], encoded: Future[bytes] | None = None
+) -> bytes:
+    """Check a view, and store its image; return it as PNG. Values and errors are those of `OpenEnrollment.add`."""
+    check_view(view)
+    clock, database = catalog.clock, catalog.database
+    png = images.encode(image_bgr) if encoded is None else encoded.result()
+    if view.captured_ns is not None:
+        age_ns = clock.now_ns() - view.captured_ns
+        view.captured_utc = clock.utc() - timedelta(microseconds=age_ns // 1000)
+    with database.catalog_errors():
+        view.image, view.image_bytes = database.images.put(png), len(png)
+    return png
 
 
 def check_view(view: View) -> None:

@@ -47,11 +47,9 @@ def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
     return [settings for _, settings in shown]
 
 
-def unfinished_camera_settings(catalog: Catalog, name: str) -> list[dict[str, Any]]:
-    """Return the camera's settings of the views of an unfinished enrollment, each combination once."""
-    begun = catalog.resumable(name)
-    shown = () if begun is None else _settings((view.id, view.evidence) for view in begun.enrollment.views)
-    return [settings for _, settings in shown]
+def camera_settings_of(views: Iterable[View]) -> list[dict[str, Any]]:
+    """Return the camera's settings of some views, each combination once."""
+    return [settings for _, settings in _settings((view.id, view.evidence) for view in views)]
 
 
 def _settings(evidence: Iterable[tuple[int, JsonObject | None]]) -> list[tuple[int, dict[str, Any]]]:

@@ -268,21 +268,33 @@ def _new(name: str, old: Enrollment, found: ReadImages, *, is_photographed: bool
         key = sha256_of((name, *shown, *([tables] if any(tables) else [])))
     new = Enrollment(key=key, object_id=0, started_utc=old.started_utc, planned_azimuth_deg=plan)
     for session in old.sessions:
-        part = Session(**{name: getattr(session, name) for name in _OF_SESSION})
+        part = same_session(session)
         if part.empty_table in found.images:
             part.empty_table, part.empty_table_bytes = found.images[part.empty_table]
         new.sessions.append(part)
     for place, view in enumerate(good):
-        copy = View(**{name: getattr(view, name) for name in _OF_VIEW})
-        copy.session = view.session
+        copy = same_view(view)
         copy.index = place if is_photographed else view.index
         copy.image, copy.image_bytes = found.images[view.image]
         new.views.append(copy)
-    _digest(new, key)
+    digest(new, key)
     return new
 
 
-def _digest(enrollment: Enrollment, key: str) -> None:
+def same_session(session: Session) -> Session:
+    """Return a new row for a session of another enrollment."""
+    return Session(**{name: getattr(session, name) for name in _OF_SESSION})
+
+
+def same_view(view: View) -> View:
+    """Return a new row for a view of another enrollment."""
+    copy = View(**{name: getattr(view, name) for name in _OF_VIEW})
+    copy.session = view.session
+    return copy
+
+
+def digest(enrollment: Enrollment, key: str) -> None:
+    """Give an enrollment its key, and its rows their digests."""
     enrollment.key = key
     parts: tuple[Enrollment | Session | View, ...] = (enrollment, *enrollment.sessions, *enrollment.views)
     for part in parts:
@@ -385,8 +397,8 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
             enrollment = there.enrollment  # an earlier one of the object: it comes into use again
         else:
             if there is not None:  # with other views, or of an object that is deleted or has another name
-                _digest(enrollment, secrets.token_hex(32))
-            new[item.name] = _store(transaction, enrollment, object_id)
+                digest(enrollment, secrets.token_hex(32))
+            new[item.name] = add_rows(transaction, enrollment, object_id)
         if known is not None:
             state.end_current(transaction, target.clock, known, EnrollmentStatus.COMPLETE)
         columns = state.ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
@@ -402,7 +414,8 @@ def _are_equal(one: Enrollment, other: Enrollment) -> bool:
     return [view.digest for view in one.views] == [view.digest for view in other.views]
 
 
-def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> Enrollment:
+def add_rows(transaction: Transaction, enrollment: Enrollment, object_id: int) -> Enrollment:
+    """Add the rows of an enrollment to an object."""
     enrollment.object_id = object_id
     views = list(enrollment.views)
     enrollment.views.clear()

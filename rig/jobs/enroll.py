@@ -1,15 +1,17 @@
-"""The jobs that enroll: one object, or a tray."""
+"""The jobs that enroll: one object, some of its views again, or a tray."""
 
 from collections.abc import Generator, Sequence
 from contextlib import closing
 
 from rig.catalog import Catalog
 from rig.catalog.journal import comparable_views, journal_words
+from rig.core.phrases import joined
 from rig.events.events import Enrolled, Event, Started
-from rig.jobs.desk import Desk, Remark, Steps
+from rig.jobs.desk import Desk, JobResult, Remark, Steps
 from rig.jobs.regions import warn_of_other_regions
 from rig.jobs.table_image import refresh_table_image
 from rig.plans.enroll import enroll as enroll_views
+from rig.plans.enroll import retake as retake_views
 from rig.plans.enroll import similar_objects
 from rig.plans.tray import TrayItem, enroll_tray, left_to_enroll
 
@@ -42,6 +44,20 @@ def enroll(
             bench, catalog, name, views=views, label=label, note=note, resume=resume, replace=replace, fly=fly
         )
         yield from _delivered(desk, catalog, events)
+
+
+def retake(desk: Desk, name: str, views: Sequence[int]) -> Steps[None]:
+    """Take ``views`` of an enrolled object again, by their indices, as `rig.plans.enroll.retake`.
+
+    The catalog itself is opened, also if it is on a server: only that has the other views.
+    """
+    with desk.open_bench() as bench, Catalog.open(desk.place, clock=bench.clock) as catalog:
+        yield from warn_of_other_regions(bench, catalog)
+        done = yield from retake_views(bench, catalog, name, views)
+    numbers = [str(index + 1) for index in done.indices]
+    text = f"{'View' if len(numbers) == 1 else 'Views'} {joined(numbers)} of {done.object_name} "
+    values = {"name": done.object_name, "taken_again": list(done.indices)}
+    yield JobResult(values, f"{text}{'was' if len(numbers) == 1 else 'were'} taken again.")
 
 
 def enroll_list(

@@ -8,7 +8,7 @@ an interrupted revolution leaves no view. Views that fail or are missing are the
 Decisions: docs/decisions/0002, docs/decisions/0019.
 """
 
-from collections.abc import Generator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -24,7 +24,8 @@ from hbr.model import symmetry
 from hbr.model.views import Views
 from rig.bench import Bench
 from rig.catalog import Catalog, OpenEnrollment, Provenance, View
-from rig.catalog.sessions import unfinished_camera_settings
+from rig.catalog.retake import Retake
+from rig.catalog.sessions import camera_settings_of
 from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded, NoObject, ObjectMoved, ObjectNotFound, RigError, RotationDisagreement
 from rig.core.json_form import plain
@@ -68,13 +69,14 @@ class EnrollmentViews:
     """Takes and stores the views of one session of an enrollment."""
 
     bench: Bench
-    enrollment: OpenEnrollment
+    enrollment: OpenEnrollment | Retake
     segment: ViewSegmenter
     table: Turntable
     viewer: Viewer
+    first: _SeenView | None = None
+    """The image that shows, when it is taken again at the end, whether the object was moved: by default the first one."""
     retakes: int = 0
     """The number of images that were taken again."""
-    _first: _SeenView | None = None
 
     def __post_init__(self) -> None:
         self._check = ObjectCheck(self.bench, self.segment.empty_table)
@@ -98,7 +100,7 @@ class EnrollmentViews:
         last = yield from self._step(left)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
         # supply the servo loses the count of revolutions, and the next enrollment would wind up the cable further.
-        first = self._first or last
+        first = self.first or last
         if first is not last:
             move = yield from announced(first.index, self.table, first.angle_deg)
             again = yield from capture(first.index, self.viewer, self.table, move.settled_ns)
@@ -139,7 +141,7 @@ class EnrollmentViews:
             )
             yield from self._store(view, attempt, segmented)
             last = _SeenView(index, angle_deg, attempt.image_bgr)
-            self._first = self._first or last
+            self.first = self.first or last
         return last
 
     def _fly(self, angles_deg: Mapping[int, float]) -> Generator[Event, None, set[int]]:
@@ -163,7 +165,7 @@ class EnrollmentViews:
             yield moved(0, (yield from announced(0, table, start_deg)))
         before = yield from capture(0, self.viewer, table, self.bench.clock.now_ns())
         self._require_object(before.image_bgr, self._azimuth_deg(start_deg))
-        self._first = _SeenView(0, start_deg, before.image_bgr)
+        self.first = _SeenView(0, start_deg, before.image_bgr)
         yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
         frames = FlightFrames(self.bench, table)
         nearest: dict[int, tuple[float, Frame]] = {}
@@ -210,7 +212,7 @@ class EnrollmentViews:
             view = View(index=index, commanded_deg=angle_deg, encoder_deg=measured_deg, azimuth_deg=azimuth_deg)
             yield from self._store(view, attempt, segmented)
             stored.add(index)
-        self._require_not_moved(self._first, after)
+        self._require_not_moved(self.first, after)
         return stored
 
     def _store(self, view: View, attempt: Attempt, segmented: DescribedView) -> Generator[Event, None, None]:
@@ -229,13 +231,14 @@ class EnrollmentViews:
         try:
             self._check(image_bgr, azimuth_deg)
         except NoObject:
-            if self._first is not None:
+            if self.first is not None:
                 self.enrollment.abandon()
             raise
 
     def _require_not_moved(self, first: _SeenView, again: Attempt) -> None:
         """Compare two frames of one angle; abandon the enrollment and raise `ObjectMoved` if the object moved."""
-        alike = image_similarity(first.image_bgr, again.image_bgr, self.bench.config.view)
+        same_size = first.image_bgr.shape == again.image_bgr.shape
+        alike = image_similarity(first.image_bgr, again.image_bgr, self.bench.config.view) if same_size else 0.0
         if alike < SAME_SIMILARITY:
             self.enrollment.abandon()
             raise ObjectMoved(
@@ -332,21 +335,11 @@ def enroll(
     in_motion = takes_in_motion(bench.config, fly)
     if in_motion:
         require_camera_time(bench.config)
-    status = empty_table_status(bench)
-    provenance = Provenance(
-        bench=bench.name,
-        devices=bench.devices(),
-        conditions={
-            **bench.conditions,
-            **bench.config.model_dump(mode="json", include={"table", "imu", "camera", "view"}),
-            "findings": list(bench.findings),
-            "empty_table": status.as_json(),
-        },
-    )
+    provenance, empty_table = _session(bench)
     # Begin or resume the enrollment in the catalog.
-    empty_table = None if status.table is None else status.table.image_bgr
     if resume:
-        check_camera(bench, unfinished_camera_settings(catalog, name))
+        begun = catalog.resumable(name)
+        check_camera(bench, camera_settings_of(begun.enrollment.views if begun else ()))
         enrollment = catalog.resume(name, provenance=provenance, empty_table=empty_table)
     else:
         enrollment = catalog.begin(
@@ -376,12 +369,7 @@ def enroll(
     if missing:
         try:
             bench.place(enrollment.object_name)
-            segment = ViewSegmenter(bench.config.view, empty_table=empty_table)
-            viewer = Viewer(bench.camera, bench.config, encodes=not in_motion)
-            with Turntable(bench) as table:
-                taking = EnrollmentViews(bench, enrollment, segment, table, viewer)
-                yield from taking.take(to_go, in_motion=in_motion)
-            retakes = taking.retakes
+            retakes = yield from _take(bench, enrollment, to_go, empty_table, in_motion=in_motion)
         except BaseException:
             if not resume:
                 with suppress(RigError):  # it has views to resume
@@ -391,6 +379,78 @@ def enroll(
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done
     return done
+
+
+def retake(bench: Bench, catalog: Catalog, name: str, indices: Collection[int]) -> Generator[Event, None, Retake]:
+    """Take views of an enrolled object again, at their angles; yields events and returns what was done.
+
+    The object must stand as it stood for the other views: afterwards, the image of the view on the other side is
+    taken again and compared with the stored one. Only then, all new views take the places of the present ones in a
+    single transaction (`rig.catalog.retake`), so after any interruption the present ones are in use.
+
+    Raises `ObjectNotFound`, `CatalogError`, `UsageError`: see `Retake.of`. `ObjectMoved`: the object does not stand as
+    it stood, or that view is bad, too. The others are as for `enroll`, and nothing changes.
+    """
+    provenance, empty_table = _session(bench)
+    taking = Retake.of(catalog, name, indices, provenance=provenance, empty_table=empty_table)
+    check_camera(bench, camera_settings_of(taking.former.views))
+    plan, table = taking.former.planned_azimuth_deg, bench.config.table
+    angles_deg = table_angles(plan, table.limits_deg, table.orientation_sign)
+    to_go = {index: angles_deg[index] for index in taking.indices}
+    # A hand that was in a picture may be in those beside it, but not in that of the other side.
+    opposite = (taking.indices[0] + len(plan) // 2) % len(plan)
+    others = sorted(set(range(len(plan))) - set(taking.indices), key=lambda index: abs(index - opposite))
+    known = taking.former.views[others[0]]
+    seen = _SeenView(known.index, angles_deg[known.index], catalog.read_image(known.image))
+    yield Started(
+        "enroll", taking.object_name, len(to_go), dict(provenance.conditions), angles_deg=tuple(to_go.values())
+    )
+    bench.place(taking.object_name)
+    try:
+        yield from _take(bench, taking, to_go, empty_table, seen)
+    except ObjectMoved as error:
+        raise ObjectMoved(
+            f"{taking.object_name} does not stand as it stood for view {known.index + 1}, or that view is bad, too. "
+            "Its present views stay in use.",
+            next_step=(
+                "Put the object exactly as it stood, and take the view again. If you do not know how it stood,",
+                Do.ENROLL_AGAIN(name=taking.object_name),
+            ),
+            evidence=error.evidence,
+        ) from error
+    taking.finish()
+    return taking
+
+
+def _session(bench: Bench) -> tuple[Provenance, NDArray[np.uint8] | None]:
+    """Return what takes the views of a session, and the sheet of its empty-table images, if there is one."""
+    status = empty_table_status(bench)
+    conditions = {
+        **bench.conditions,
+        **bench.config.model_dump(mode="json", include={"table", "imu", "camera", "view"}),
+        "findings": list(bench.findings),
+        "empty_table": status.as_json(),
+    }
+    provenance = Provenance(bench=bench.name, devices=bench.devices(), conditions=conditions)
+    return provenance, None if status.table is None else status.table.image_bgr
+
+
+def _take(
+    bench: Bench,
+    enrollment: OpenEnrollment | Retake,
+    angles_deg: Mapping[int, float],
+    empty_table: NDArray[np.uint8] | None,
+    first: _SeenView | None = None,
+    *,
+    in_motion: bool = False,
+) -> Generator[Event, None, int]:
+    """Take and store views, as `EnrollmentViews.take`; return how many images were taken again."""
+    segment = ViewSegmenter(bench.config.view, empty_table=empty_table)
+    viewer = Viewer(bench.camera, bench.config, encodes=not in_motion)
+    with Turntable(bench) as table:
+        taking = EnrollmentViews(bench, enrollment, segment, table, viewer, first)
+        yield from taking.take(angles_deg, in_motion=in_motion)
+    return taking.retakes
 
 
 def similar_objects(views: Views, name: str) -> SimilarObjects:

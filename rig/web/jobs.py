@@ -15,7 +15,16 @@ from rig.core.errors import JobNotFound, JobRejected, ObjectExists, RigError, St
 from rig.core.files import read, write
 from rig.core.next_steps import Do, NextStep
 from rig.plans.operator import Choice
-from rig.web.requests import EnrollRequest, IdentifyRequest, Job, JobQuestion, JobRequest, JobState, TrayRequest
+from rig.web.requests import (
+    EnrollRequest,
+    IdentifyRequest,
+    Job,
+    JobQuestion,
+    JobRequest,
+    JobState,
+    RetakeRequest,
+    TrayRequest,
+)
 
 FILE: Final = "jobs.json"
 STORED: Final = 200
@@ -266,7 +275,7 @@ class JobQueue:
                 job.resume = request.model_copy(update={"resume": True, "replace": False})
             elif not isinstance(error, ObjectExists):  # the same request would be rejected again
                 job.resume = request
-        elif isinstance(request, TrayRequest | IdentifyRequest):
+        elif isinstance(request, TrayRequest | IdentifyRequest | RetakeRequest):
             job.resume = request  # of a tray, complete objects are skipped, and interrupted ones resumed
 
     def _find(self, job_id: str) -> Job:

@@ -43,6 +43,17 @@ class EnrollRequest(TrayObject):
     fly: Fly = None
 
 
+class RetakeRequest(_Request):
+    """Take views of an object again, which must stand as it stood; the present ones stay until all are taken."""
+
+    kind: Literal["retake"] = "retake"
+    name: Name
+    views: Annotated[
+        list[Annotated[int, Field(ge=0, lt=10_000)]],
+        Field(min_length=1, max_length=10_000, description="`index` of each view in GET /api/v1/objects/{name}"),
+    ]
+
+
 class TrayRequest(_Request):
     """Enroll several objects one after the other. The job asks for each object, and skips those that are complete."""
 
@@ -143,6 +154,7 @@ class CalibrateRequest(_Request):
 
 JobRequest = Annotated[
     EnrollRequest
+    | RetakeRequest
     | TrayRequest
     | IdentifyRequest
     | EmptyTableRequest

@@ -27,7 +27,7 @@ from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ra
 from rig.events.wording import next_steps, page_line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Step, Steps
 from rig.jobs.doctor import examine
-from rig.jobs.enroll import enroll, enroll_list
+from rig.jobs.enroll import enroll, enroll_list, retake
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
@@ -271,6 +271,7 @@ def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:
 
 JOBS: Final[dict[type[BaseModel], Callable[..., Steps[object]]]] = {
     requests.EnrollRequest: _enroll,
+    requests.RetakeRequest: retake,
     requests.TrayRequest: _tray,
     requests.IdentifyRequest: _identify,
     requests.EmptyTableRequest: take_table_image,

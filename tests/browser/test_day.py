@@ -384,3 +384,35 @@ def test_search_in_motion_shows_its_frames_and_stop_ends_it_during_the_rotation(
     page.wait_for_selector("#stop-state:has-text('Stopped')", timeout=WAIT_MS)
     page.wait_for_selector("#answer:has-text('Stopped')", timeout=WAIT_MS)
     assert page.locator("#answer.found").count() == 0
+
+
+def test_bad_view_is_taken_again_unless_the_object_stands_otherwise(page, serve_process):
+    server = serve_process("bench.sim.speed=50", "enroll.views=6", *SMALL)
+    page.goto(f"{server.url}enroll")
+    put(page, "teapot")
+    page.fill("#name", "teapot")
+    page.click("#go:not([disabled])")
+    enrolled(page, "teapot")
+    before = call(server, "objects/teapot")["views_taken"]
+    page.goto(f"{server.url}object?name=teapot")
+    page.wait_for_selector("#viewer .number")
+    page.focus("#viewer input")
+    page.keyboard.press("ArrowRight")
+    place = page.text_content("#viewer .number")
+    page.click("#retake")
+    page.click("dialog button:has-text('Take it again')")
+    page.wait_for_selector(".toast:has-text('was taken again')", timeout=WAIT_MS)
+    page.wait_for_selector("#enrollments li:has-text('replaced')")
+    assert page.text_content("#viewer .number") == place
+    after = call(server, "objects/teapot")["views_taken"]
+    images = [[one["captured_utc"] for one in views] for views in (before, after)]
+    assert sum(old != new for old, new in zip(*images, strict=True)) == 1
+    # Put again, it stands otherwise: the views stay as they are.
+    page.goto(server.url)
+    put(page, "lamp")
+    put(page, "teapot")
+    page.goto(f"{server.url}object?name=teapot")
+    page.click("#retake")
+    page.click("dialog button:has-text('Take it again')")
+    page.wait_for_selector("#job .failure:has-text('does not stand as it stood')", timeout=WAIT_MS)
+    assert call(server, "objects/teapot")["views_taken"] == after

@@ -20,6 +20,7 @@ from rig.catalog.facts import Derived
 from rig.catalog.jobs import finished
 from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
+from rig.catalog.retake import Retake
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.catalog.upkeep import collect_garbage
 from rig.core.clock import SystemClock
@@ -80,6 +81,13 @@ def enroll_again(catalog: Catalog, report: Report) -> None:
         _enroll(catalog, report, "mug", replace=True)
 
 
+def take_again(catalog: Catalog, _: Report) -> None:
+    if not any("taken_again" in line.details for line in catalog.log()):
+        begun = Retake.of(catalog, "mug", [1], provenance=PROVENANCE, empty_table=EMPTY_TABLE)
+        begun.add(record(1), image(31))
+        begun.finish()
+
+
 def continue_(catalog: Catalog, report: Report) -> None:
     if catalog.resumable("begun") is not None:
         _continue(catalog.resume("begun", provenance=PROVENANCE), report)
@@ -134,6 +142,7 @@ WORK: dict[str, Callable[[Catalog, Report], None]] = {
     "enroll": enroll,
     "enroll again": enroll_again,
     "continue": continue_,
+    "take again": take_again,
     "transfer": move,
     "replace": replace,
     "delete": delete,

@@ -26,7 +26,7 @@ from tests.rig.catalog.catalog_samples import without_waiting
 
 KILLS = int(os.environ.get("RIG_TEST_KILLS", "1"))
 """Kills of each kind of work; `make test-kills` asks for more."""
-SIMILAR = ("enroll again", "continue", "replace", "restore", "rename", "correct", "describe")
+SIMILAR = ("enroll again", "continue", "take again", "replace", "restore", "rename", "correct", "describe")
 """Work that stores as other work does; with one kill, only the nightly tests do it."""
 VIEW_BY_VIEW = {"enroll": "new", "enroll again": "mug", "continue": "begun"}
 """Work that keeps each view, and its object; all other work takes effect as a whole or not at all."""

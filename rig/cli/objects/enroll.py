@@ -39,6 +39,12 @@ def enroll(
     replace: Annotated[
         bool, typer.Option("--replace", help="Enroll again. The old views stay in use until the new ones are complete.")
     ] = False,
+    retake: Annotated[
+        list[int] | None,
+        typer.Option(
+            min=1, metavar="N", help="Take view N of the enrolled object again; it stands as it stood. Repeatable."
+        ),
+    ] = None,
     fly: Annotated[
         bool,
         typer.Option("--fly", help="Take the views in one revolution without a stop (default: enroll.mode)."),
@@ -60,17 +66,22 @@ def enroll(
     Example: rig enroll --list tray.csv --bench sim
 
     Example: rig enroll mug-white --bench sim --fly
+
+    Example: rig enroll mug-white --bench sim --retake 6
     """
     from rig.cli.ui.desk import CommandDesk
     from rig.cli.ui.live import LiveView
     from rig.events.events import Accepted, Enrolled, Started
     from rig.jobs.enroll import enroll as enroll_job
     from rig.jobs.enroll import enroll_list
+    from rig.jobs.enroll import retake as retake_job
     from rig.motion.move import MotionTimes
     from rig.plans.estimate import TimeLeft
     from rig.plans.tray import read_tray
 
-    _check(name, tray, label=label, note=note, resume=resume, replace=replace)
+    again = [number - 1 for number in retake or ()]
+    options = {"label": label, "note": note, "resume": resume, "replace": replace, "views": views, "fly": fly}
+    _check(name, tray, retake=retake, **options)
     items = read_tray(tray) if tray else ()
     how: dict[str, Any] = {"views": views, "fly": fly or None, "ask": not yes}
     stored_views = enrolled = 0
@@ -86,7 +97,9 @@ def enroll(
     with LiveView(settings) as view:
         desk = CommandDesk(settings, view.hide, yes=yes)
         desk.deliver_waiting()
-        if name is not None:
+        if name is not None and again:
+            job = retake_job(desk, name, again)
+        elif name is not None:
             labels = ", ".join(label) if label else None
             job = enroll_job(desk, name, **how, label=labels, note=note, resume=resume, replace=replace)
         else:
@@ -95,7 +108,7 @@ def enroll(
             desk.run(job, show)
         except BaseException:
             view.hide()
-            if stored_views:
+            if stored_views and not again:
                 one = Do.CONTINUE_ENROLLMENT(name=name).with_options(settings.arguments())
                 step = one if tray is None else "To continue with the list, run the same command again."
                 print(f"The views taken so far are stored. {in_words(step)}", file=sys.stderr)
@@ -104,13 +117,19 @@ def enroll(
         print(f"{enrolled} of {len(items)} objects enrolled in this run.", file=sys.stderr)
 
 
-def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, **texts: Any) -> None:
+def _check(name: str | None, tray: Path | None, *, retake: object, **options: object) -> None:
     if (name is None) == (tray is None):
         raise UsageError(
             "No object is given." if name is None else "NAME and --list cannot be used together.",
             next_step="Give the name of one object, or a list of objects with --list FILE.",
         )
-    given = [f"--{key}" for key, value in {**texts, "resume": resume, "replace": replace}.items() if value]
+    given = [f"--{key}" for key, value in options.items() if value]
+    if retake and given and tray is None:
+        raise UsageError(
+            f"{', '.join(given)} cannot be used with --retake.",
+            next_step=("The view is taken at rest, at its angle. To take all views again,", Do.ENROLL_AGAIN()),
+        )
+    given = [*(["--retake"] if retake else []), *(option for option in given if option not in ("--views", "--fly"))]
     if tray is not None and given:
         raise UsageError(
             f"{', '.join(given)} cannot be used with --list.",

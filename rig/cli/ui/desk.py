@@ -90,6 +90,7 @@ class CommandDesk(Desk):
                     case Remark() as remark:
                         self.note(remark)
                     case JobResult() as result:
+                        self._before()
                         self._settings.say(result.text, result.values)
                     case Progress() as progress:
                         values = {"event": "progress", "share": progress.share, "words": progress.words}

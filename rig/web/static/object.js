@@ -1,4 +1,4 @@
-import { $, API, act, ask, at, canOperate, counted, dayOf, get, h, on, request, start, toast, when } from "./rig.js";
+import { $, API, act, ask, at, canOperate, counted, dayOf, followJob, get, h, isEnded, on, request, showJob, start, submit, toast, when } from "./rig.js";
 import { lineChart, picture, viewPicture } from "./pictures.js";
 
 let one = null;
@@ -22,6 +22,7 @@ async function showView(view) {
     ["Too bright", e.saturated_share === undefined ? null : `${(100 * e.saturated_share).toFixed(1)} %`],
     ["Exposure", e.locks?.exposure_us && `${(e.locks.exposure_us / 1000).toFixed(1)} ms`],
   ]);
+  $("retake").disabled = !canOperate() || !view.captured_utc; // of an import, no bench knows where it stood
   if (!$("outline-on").checked) return;
   const place = one.views_taken.indexOf(view);
   silhouettes[place] ||= get(`/silhouette?object=${at(one.name)}&index=${place}`).catch(() => null);
@@ -108,6 +109,34 @@ $("delete").addEventListener("click", () => act(async () => {
   $("main").inert = true;
   toast(`${one.name} is deleted. Searches do not find it any more.`, async () => { await request("POST", "/undelete", { name: one.name }); $("main").inert = false; await load(); });
 }));
+
+
+// -- take one view again -------------------------------------------------------------------------------------------------------
+
+$("retake").addEventListener("click", async () => {
+  const { index, azimuth_deg: azimuth } = $("viewer").views[$("viewer").place];
+  const words = [
+    h("p", {}, `${one.name} must stand on the table as it stood when it was enrolled: at the same place, and turned to the same side.`),
+    h("p", {}, `The table rotates to ${azimuth.toFixed(0)}°, takes the view, and compares the other side with its stored view. The present view stays in use until the new one has passed.`),
+  ];
+  if ((await ask(`Take view ${index + 1} again?`, words, [["take", "Take it again"]])) === "take") submit({ kind: "retake", name: one.name, views: [index] });
+});
+
+let retaking = null;
+followJob(["retake"], {
+  begin() {},
+  event() {},
+  render(job) {
+    if (job.request.name !== wanted()) return;
+    showJob($("job"), job.state === "done" ? null : job);
+    if (!isEnded(job)) retaking = job.id;
+    else if (job.state === "done" && retaking === job.id) {
+      retaking = null;
+      toast(job.result_text);
+      act(load);
+    }
+  },
+});
 
 on("hello", () => act(load));
 start();

@@ -98,7 +98,8 @@ class RigViewer extends HTMLElement {
       frame.onpointercancel = frame.onpointerup;
     });
     for (const view of this.views) new Image().src = viewPicture(view.id); // so that it turns without waiting
-    this.showPlace(0);
+    this.showPlace(this.name === name ? this.place : 0);
+    this.name = name;
   }
 
   showPlace(place) {

@@ -45,7 +45,7 @@ const SENTENCES = {
   "enrollment abandoned": ({ object_name: name }) => `ended an enrollment of ${name}`,
   "enrollment discarded": ({ object_name: name }) => `discarded an enrollment of ${name}`,
   "enrollment superseded": ({ object_name: name }) => `replaced the earlier enrollment of ${name}`,
-  enrolled: ({ object_name: name, details }) => `enrolled ${name} with ${counted(details.views, "view")}`,
+  enrolled: ({ object_name: name, details }) => details.taken_again ? `took ${counted(details.taken_again.length, "view")} of ${name} again` : `enrolled ${name} with ${counted(details.views, "view")}`,
   identified: ({ object_name: name, details }) => (OUTCOMES[details.outcome] || (() => "identified an object"))(name) + (details.sample ? `, sample ${details.sample}` : ""),
   "result corrected": ({ object_name: name, details }) => `corrected answer ${details.result}${name ? ` to ${name}` : ""}${details.reason ? `: ${details.reason}` : ""}`,
   renamed: ({ object_name: name, details }) => `renamed ${details.old_name || details.before || "an object"} to ${name}`,

@@ -377,6 +377,7 @@ export const isEnded = (job) => ENDED.includes(job.state);
 
 export function jobTitle(job) {
   const request_ = job.request;
+  if (request_.kind === "retake") return `Take view ${request_.views.map((index) => index + 1).join(", ")} of ${request_.name} again`;
   const what = request_.name || (request_.angle_deg !== undefined ? `to ${number(request_.angle_deg)}°` : "");
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
 }
@@ -386,7 +387,8 @@ export function jobTitle(job) {
 const proposed = new Map();
 
 /** Return all that the request of a job says besides its title. */
-function jobDetails({ request: { kind: _kind, name: _name, angle_deg: _angle, ...others } }) {
+function jobDetails({ request: { kind, name: _name, angle_deg: _angle, ...others } }) {
+  if (kind === "retake") return "";
   const words = (value) => (Array.isArray(value) ? value.map((one) => one.name ?? one).join(", ") : value);
   return Object.entries(others).filter(([, value]) => value !== null && value !== false).map(([key, value]) => `${key.replaceAll("_", " ")}${value === true ? "" : `: ${words(value)}`}`).join("; ");
 }

@@ -55,6 +55,24 @@ def halted(monkeypatch) -> Halted:
     return halt
 
 
+def test_view_is_taken_again_and_the_others_stay(serve):
+    served = serve("bench.sim.object='lamp'")
+    served.run(kind="enroll", name="lamp", views=4)
+    before = served.client.get("/api/v1/objects/lamp").json()
+    job = served.run(kind="retake", name="lamp", views=[2])
+    assert job["state"] == "done", job["error"]
+    assert job["result"] == {"name": "lamp", "taken_again": [2]}
+    after = served.client.get("/api/v1/objects/lamp").json()
+    changed = [
+        old["captured_utc"] != new["captured_utc"]
+        for old, new in zip(*(one["views_taken"] for one in (before, after)), strict=True)
+    ]
+    assert changed == [False, False, True, False]
+    assert [one["status"] for one in after["enrollments"]] == ["complete", "superseded"]
+    missing = served.run(kind="retake", name="lamp", views=[4])
+    assert (missing["state"], missing["error"]["code"], missing["resume"]["views"]) == ("failed", 200, [4])
+
+
 def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     served = serve("bench.sim.object='mug-white'")
     for name in ("mug-white", "lamp"):

@@ -20,6 +20,9 @@ def test_label_option_is_repeatable(rig):
         (("enroll", "clock", "--list", "x.csv"), "NAME and --list cannot be used together"),
         (("enroll", "--list", "x.csv", "--replace", "--label", "a"), "--label, --replace"),
         (("enroll", "--list", "x.csv"), "cannot be read"),
+        (("enroll", "--list", "x.csv", "--retake", "2"), "--retake cannot be used with --list"),
+        (("enroll", "lamp", "--retake", "2", "--views", "8", "--fly"), "--views, --fly cannot be used with --retake"),
+        (("enroll", "lamp", "--retake", "999"), "has the views 1 to"),
     ],
 )
 def test_enroll_rejects_wrong_options_with_a_next_step(rig, arguments, words):
@@ -27,6 +30,14 @@ def test_enroll_rejects_wrong_options_with_a_next_step(rig, arguments, words):
     assert done.exit_code == 2
     assert words in done.stderr
     assert "Next step:" in done.stderr
+
+
+def test_view_is_taken_again(rig):
+    done = rig("enroll", "lamp", "--retake", "2", "--retake", "3")
+    assert done.exit_code == 0, done.output
+    assert "Views 2 and 3 of lamp were taken again." in done.stdout
+    entry = json.loads(rig("log", "--json").stdout.splitlines()[-1])
+    assert "taken_again" in json.dumps(entry)
 
 
 def test_operator_is_asked_for_each_object(rig, with_operator):
