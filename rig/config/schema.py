@@ -151,6 +151,10 @@ class ServeConfig(Section):
         "the host, as in token:TOKEN@left.local",
     )
 
+    find: bool = Field(
+        False, description="also show benches that announce themselves in the local network; needs hbr-rig[mdns]"
+    )
+
     @field_validator("benches")
     @classmethod
     def _addresses(cls, benches: dict[str, str]) -> dict[str, str]:

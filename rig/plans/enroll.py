@@ -74,7 +74,7 @@ class EnrollmentViews:
     table: Turntable
     viewer: Viewer
     first: _SeenView | None = None
-    """The image that shows, when it is taken again at the end, whether the object was moved: by default the first one."""
+    """The image that shows, taken again at the end, whether the object was moved: by default the first one."""
     retakes: int = 0
     """The number of images that were taken again."""
 

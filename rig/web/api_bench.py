@@ -33,7 +33,7 @@ from rig.web.answers import (
     Svg,
     TokenRow,
 )
-from rig.web.benches import OtherBenches
+from rig.web.benches import BenchesInNetwork, OtherBenches
 from rig.web.hub import MAX_LISTENERS
 from rig.web.requests import AnswerBody, ByHand, GotoRequest, Job, JobRequest, JobState, LeaseBody, LoginBody, TokenBody
 from rig.web.server import (
@@ -132,7 +132,8 @@ def _require_login(person: Person, name: str) -> None:
 
 
 def add_bench(routes: Routes, server: Server) -> None:
-    benches = OtherBenches(server.setup.config.serve.benches)
+    others = server.setup.config.serve
+    benches = OtherBenches(others.benches, BenchesInNetwork() if others.find else None)
 
     @routes.watch.get("/status", tags=["bench"], response_model=Status)
     def get_status() -> Any:
@@ -146,7 +147,10 @@ def add_bench(routes: Routes, server: Server) -> None:
 
     @routes.watch.get("/benches", tags=["bench"])
     async def list_benches() -> ListOf[OtherBench]:
-        """List the benches of the setting `serve.benches`, with state, running job and last answer of each."""
+        """List other benches, with state, running job and last answer of each.
+
+        They are those of the setting `serve.benches` and, with `serve.find`, those in the local network.
+        """
         found = await benches.overview()
         return ListOf(items=found, total=len(found), next=None)
 

@@ -56,7 +56,8 @@ def create_app(server: Server) -> FastAPI:
         add(routes, server)
     for router in vars(routes).values():
         app.include_router(router, prefix=API, responses=_ERRORS)
-    app.include_router(pages(server.setup.bench, with_others=bool(server.setup.config.serve.benches)))
+    others = server.setup.config.serve
+    app.include_router(pages(server.setup.bench, with_others=bool(others.benches) or others.find))
     add_reference(app)
     app.mount("/static", StaticFiles(packages=[("rig.web", "static"), ("rig.charts", "static")]), name="static")
 

@@ -100,7 +100,8 @@ def test_files_beside_the_script_fit_together():
     unit = configparser.RawConfigParser(strict=False)
     unit.read(DOCS / "deploy" / "rig-pi.conf")
     assert unit["Service"]["ExecStart"].split()[0] == "/opt/rig/bin/rig"
-    assert f"--port {service.findtext('service/port')} " in unit["Service"]["ExecStart"]
+    assert {one.findtext("type") for one in service.iter("service")} == {"_http._tcp", "_hbr-rig._tcp"}
+    assert all(f"--port {one.text} " in unit["Service"]["ExecStart"] for one in service.iter("port"))
 
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")

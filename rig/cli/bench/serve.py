@@ -10,7 +10,7 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
-from rig.core.errors import UsageError
+from rig.core.errors import ExtraMissing, UsageError
 from rig.core.next_steps import Do
 
 DEFAULT_PORT = 8420  # any number that few other services use
@@ -114,6 +114,11 @@ def serve(
             text = "Every user of this computer can operate the bench there. With --login, each needs a token."
             print(text, file=sys.stderr, flush=True)
 
+    if settings.load().serve.find:
+        try:
+            import zeroconf  # noqa: F401
+        except ImportError as error:
+            raise ExtraMissing.of("mdns", "Benches in the network", error) from error
     setup = Setup(
         bench=settings.bench_name,
         config=settings.load(),

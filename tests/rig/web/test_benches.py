@@ -1,6 +1,10 @@
 """The overview of several benches: what their servers answer, and which does not answer."""
 
+import asyncio
 import socket
+import threading
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -8,6 +12,8 @@ import pytest
 from rig.config import load_config
 from rig.core.errors import ConfigError
 from rig.web.access import Role
+from rig.web.answers import OtherBench
+from rig.web.benches import SERVICE, BenchesInNetwork, OtherBenches
 from tests.rig.web.conftest import Served, over_http, starting
 
 SECRET = "rig_never-stored"
@@ -63,3 +69,46 @@ def test_address_of_a_bench_is_checked(address: str) -> None:
         load_config(None, [f"serve.benches.left='{address}'"])
     (mistake,) = error.value.evidence["mistakes"]
     assert "left needs an address such as http://left.local:8420" in mistake
+
+
+def test_bench_that_announces_itself_in_the_network_is_found_until_it_leaves(tmp_path: Path) -> None:
+    """On the loopback interface, with real packets."""
+    zeroconf = pytest.importorskip("zeroconf", reason="the extra hbr-rig[mdns] is not installed")
+    loopback = "127.0.0.1"
+    network = BenchesInNetwork([loopback])
+    with closing(network), closing(zeroconf.Zeroconf([loopback])) as other, starting(tmp_path) as start:
+        served = start().opened()
+        with over_http(served) as place:
+
+            def announced(title: str, server: str) -> "zeroconf.ServiceInfo":
+                address = socket.inet_aton(loopback)
+                port = int(place.rpartition(":")[2])
+                return zeroconf.ServiceInfo(SERVICE, f"{title}.{SERVICE}", port, addresses=[address], server=server)
+
+            benches = OtherBenches({"named": "http://127.0.0.1:9"}, network)
+            left = announced("Bench on left", "localhost.")
+            for info in (left, announced("other name", "elsewhere.local."), announced("evil", "x/y.local.")):
+                other.register_service(info, cooperating_responders=True)
+            until(lambda: len(network.places()) == 2)
+
+            def overview() -> dict[str, OtherBench]:
+                return {one.name: one for one in asyncio.run(benches.overview())}
+
+            until(lambda: all(one.problem != "does not answer" for one in overview().values()))
+            found = overview()
+            assert list(found) == ["named", "Bench on left", "other name"]
+            assert found["Bench on left"].problem is None
+            assert found["Bench on left"].status.state == "ready"
+            assert found["Bench on left"].address == f"http://localhost:{place.rpartition(':')[2]}/"
+            # Its server does not answer to that name; the numeric address was that of the announcement.
+            assert found["other name"].problem.startswith("answers 421")
+            other.unregister_service(left)
+            until(lambda: "Bench on left" not in network.places())
+
+
+def until(condition: Callable[[], bool]) -> None:
+    for _ in range(3000):
+        if condition():
+            return
+        threading.Event().wait(0.01)
+    pytest.fail("it does not happen")

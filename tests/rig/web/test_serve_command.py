@@ -1,5 +1,7 @@
 """`rig serve`: who may operate the bench, and what it says about that."""
 
+import sys
+
 import pytest
 from typer.testing import CliRunner
 
@@ -41,6 +43,13 @@ def test_login_asks_for_a_token_on_this_computer_too(serve):
     done, listening = serve("--login")
     assert listening.needs_login
     assert "Every user" not in done.stderr
+
+
+def test_search_in_the_network_without_its_package_is_an_error_at_the_start(serve, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zeroconf", None)
+    done, started = serve("--set", "serve.find=true")
+    assert (done.exit_code, started) == (3, None)
+    assert "hbr-rig[mdns]" in done.stderr
 
 
 @pytest.mark.parametrize("content", [None, "no certificate"])
