@@ -133,31 +133,26 @@ async def watcher(request: Request) -> Person:
     return person
 
 
-async def operator(request: Request, person: Annotated[Person, Depends(watcher)]) -> Person:
-    """Return the operator who sends the request, and renew the lease. Raises `Forbidden`, `LeaseHeld`."""
-    server: Server = request.app.state.server
-    require_operate(person)
-    server.lease.take(person)
-    return person
-
-
 async def manager(person: Annotated[Person, Depends(watcher)]) -> Person:
     """Return the sender of the request, who may operate, but need not have the lease. Raises `Forbidden`."""
-    require_operate(person)
-    return person
-
-
-async def proposer(request: Request, person: Annotated[Person, Depends(watcher)]) -> Person:
-    """Return the sender, who may propose jobs, or is an operator with the lease. Raises as `operator`."""
-    return person if person.role is Role.PROPOSE else await operator(request, person)
-
-
-def require_operate(person: Person) -> None:
     if person.role is not Role.OPERATE:
         raise Forbidden(
             f"The token {person.name} may only {person.role}.",
             next_step=("Use a token with the role operate.", Do.NEW_TOKEN(role="operate")),
         )
+    return person
+
+
+async def operator(request: Request, person: Annotated[Person, Depends(manager)]) -> Person:
+    """Return the operator who sends the request, and renew the lease. Raises `Forbidden`, `LeaseHeld`."""
+    server: Server = request.app.state.server
+    server.lease.take(person)
+    return person
+
+
+async def proposer(request: Request, person: Annotated[Person, Depends(watcher)]) -> Person:
+    """Return the sender, who may propose jobs, or is an operator with the lease. Raises as `operator`."""
+    return person if person.role is Role.PROPOSE else await operator(request, await manager(person))
 
 
 Result = TypeVar("Result")

@@ -1,5 +1,5 @@
 import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table, valuesOf } from "./rig.js";
-import { pathDrawing, picture, viewPicture } from "./pictures.js";
+import { comparisons, pathDrawing } from "./pictures.js";
 import "./shelf.js";
 
 // -- one object: a name that is known already is a choice ------------------------------------------------------------------
@@ -170,13 +170,8 @@ async function showSimilar() {
   compared = key;
   $("similar-section").hidden = true;
   if (!similar?.objects.length) return;
-  const parts = [];
-  for (const other of similar.objects) {
-    const found = await get(`/pairs?object=${at(similar.name)}&other=${at(other.name)}`).catch(() => null);
-    if (!found || compared !== key) continue;
-    const pair = (one, words) => h("div", {}, h("h3", {}, words), h("div", { class: "pair" }, picture(viewPicture(one.view), `${similar.name} at ${one.azimuth_deg.toFixed(0)}°`, similar.name), picture(viewPicture(one.other_view), `${other.name} at ${one.other_azimuth_deg.toFixed(0)}°`, other.name)));
-    parts.push(h("div", { class: "columns" }, pair(found.alike, "Most alike"), pair(found.different, "Most different")));
-  }
+  const parts = await comparisons(similar.name, similar.objects);
+  if (compared !== key) return;
   $("similar-title").textContent = `${similar.name} looks like ${similar.objects.map((one) => one.name).join(", ")}`;
   $("similar").replaceChildren(...parts);
   $("similar-section").hidden = !parts.length;

@@ -1,5 +1,5 @@
 import { $, API, act, ask, at, canOperate, counted, dayOf, followJob, get, h, isEnded, on, request, showJob, start, submit, toast, when } from "./rig.js";
-import { lineChart, picture, viewPicture } from "./pictures.js";
+import { comparisons, lineChart } from "./pictures.js";
 
 let one = null;
 const wanted = () => new URLSearchParams(location.search).get("name") || "";
@@ -67,13 +67,7 @@ async function load() {
 }
 
 async function showSimilar() {
-  const parts = [];
-  for (const other of one.similar?.objects || []) {
-    const found = await get(`/pairs?object=${at(one.name)}&other=${at(other.name)}`).catch(() => null);
-    if (!found) continue;
-    const pair = (p, words) => h("div", {}, h("h3", {}, words), h("div", { class: "pair" }, picture(viewPicture(p.view), `${one.name} at ${p.azimuth_deg.toFixed(0)}°`, one.name), picture(viewPicture(p.other_view), `${other.name} at ${p.other_azimuth_deg.toFixed(0)}°`, h("a", { href: `/object?name=${at(other.name)}` }, other.name))));
-    parts.push(h("div", { class: "columns" }, pair(found.alike, `${other.name}: most alike`), pair(found.different, "Most different")));
-  }
+  const parts = await comparisons(one.name, one.similar?.objects || []);
   $("similar").replaceChildren(...parts);
   $("similar-section").hidden = !parts.length;
 }
@@ -124,8 +118,6 @@ $("retake").addEventListener("click", async () => {
 
 let retaking = null;
 followJob(["retake"], {
-  begin() {},
-  event() {},
   render(job) {
     if (job.request.name !== wanted()) return;
     showJob($("job"), job.state === "done" ? null : job);

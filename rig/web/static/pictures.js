@@ -1,5 +1,5 @@
 // Pictures and charts: the live image, an object that turns, pairs of pictures, the path of a search, lines and columns.
-import { API, at, duration, h, number, on } from "./rig.js";
+import { API, at, duration, get, h, number, on } from "./rig.js";
 
 export const viewPicture = (id) => `${API}/views/${id}/picture`;
 export const posePicture = (name, azimuthDeg = 0) => `${API}/pose-picture?object=${at(name)}&azimuth_deg=${azimuthDeg.toFixed(1)}`;
@@ -7,6 +7,14 @@ export const posePicture = (name, azimuthDeg = 0) => `${API}/pose-picture?object
 /** Return a picture with words below it. */
 export function picture(source, alt, ...words) {
   return h("figure", {}, h("div", { class: "frame" }, h("img", { src: source, alt })), words.length > 0 && h("figcaption", {}, ...words));
+}
+
+/** Return for each of some objects where an object and it look most alike, and where they differ most. */
+export async function comparisons(name, others) {
+  const side = (view, azimuth, of, words) => picture(viewPicture(view), `${of} at ${azimuth.toFixed(0)}°`, words);
+  const pair = (found, other, words) => h("div", {}, h("h3", {}, words), h("div", { class: "pair" }, side(found.view, found.azimuth_deg, name, name), side(found.other_view, found.other_azimuth_deg, other, h("a", { href: `/object?name=${at(other)}` }, other))));
+  const found = await Promise.all(others.map((other) => get(`/pairs?object=${at(name)}&other=${at(other.name)}`).catch(() => null)));
+  return others.flatMap(({ name: other }, k) => (found[k] ? [h("div", { class: "columns" }, pair(found[k].alike, other, `${other}: most alike`), pair(found[k].different, other, "Most different"))] : []));
 }
 
 // -- the live image: one short request after the other. An endless one would occupy one of the browser's few connections ---

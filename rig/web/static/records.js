@@ -33,7 +33,7 @@ if ($("calibrations")) {
     table($("history"), ["Calibration", "Date", "Outcome", "Values"], history.map((one) => [one.name, when(one.when_utc), one.passed ? "passed" : "not passed", Object.entries(one.values).map(([key, value]) => `${key} ${value}`).join("; ")]));
   };
   on("hello", () => act(load));
-  followJob(["calibrate"], { begin() {}, event() {}, render(job) { showJob($("job"), job); if (job.state === "done") act(load); } });
+  followJob(["calibrate"], { render(job) { showJob($("job"), job); if (job.state === "done") act(load); } });
 }
 
 // -- the log ------------------------------------------------------------------------------------------------------------------

@@ -462,7 +462,7 @@ const placeOf = (id) => Number(id.split("-").at(-1));
  * Follow the newest job of these kinds. A page that is opened later sees the same as one that was open all the time:
  * `begin(job)`, then `event(event, job)` for all its events, and `render(job, loaded)` when the page has to change.
  */
-export function followJob(kinds, { begin, event, render }) {
+export function followJob(kinds, { begin = () => {}, event = () => {}, render }) {
   let shown = null;
   let waiting = null; // events that came while those before them are loaded
   let opened = 0;
