@@ -30,7 +30,7 @@ from rig.web.work import run_job
 from rig.web.worker import BenchWorker
 
 # longer: a failed start is noticed late; shorter: a busy small computer imports the web packages in vain
-START_S: Final = 30.0
+START_S: Final = 120.0
 END_S: Final = 6.0
 """Longer than `rig.web.front.END_S`, after which a web process ends itself."""
 # a long import or report may hold the interpreter for seconds; longer: STOP of a page is dead for longer
