@@ -76,7 +76,7 @@ class RotationReason(Worded):
     LESS_SIMILAR_SIDE = "less-similar-side"
     ONE_CANDIDATE = "one-candidate", "there is no second candidate to compare with, so a new side is viewed"
     SEPARATES_CANDIDATES = "separates-candidates"
-    NEW_SIDE = "new-side", "no second object is likely, so a new side is viewed"
+    NEW_SIDE = "new-side", "no other enrolled object is likely, so a new side is viewed"
     SEVERAL_POSES = "several-poses", "the leading candidate fits in several poses, so a new side is viewed"
     EVEN_STEPS = "even-steps", "the views are taken in even steps"
     RANDOM = "random", "the rotation is random"

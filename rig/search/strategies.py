@@ -31,7 +31,7 @@ ROTATION_STEP_DEG: Final = 5.0
 """Step between the rotations that the dense search weighs."""
 
 ALONE: Final = 0.95
-"""Probability of the leading candidate from which no second object is likely."""
+"""Probability of the leading candidate, among the enrolled objects, from which no other one is likely."""
 
 _REVISIT_DEG: Final = 10.0  # as in the paper's search (`hbr.paper.next_view`): a nearer view shows nothing new
 _DRAWS: Final = 20  # with views on all sides, no azimuth is free; then the last one is as good as any

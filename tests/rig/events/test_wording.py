@@ -65,7 +65,7 @@ def test_dense_decisions_name_the_two_candidates() -> None:
     found = Decided(0, "left", 90.0, -90.0, None, None, ("a", "b"), reason, weighed=weighed)
     assert decision_words(found) == "left 90.0°: distinguishes a from b, similarity 0.50 there (0.50–0.95 all around)."
     alone = replace(found, candidates=(), reason=RotationReason.NEW_SIDE)
-    assert decision_words(alone) == "left 90.0°: no second object is likely, so a new side is viewed."
+    assert decision_words(alone) == "left 90.0°: no other enrolled object is likely, so a new side is viewed."
 
 
 def test_answers_begin_with_the_result() -> None:
