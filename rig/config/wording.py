@@ -41,11 +41,15 @@ _KINDS: Mapping[Any, str] = {
 
 @dataclass(frozen=True, slots=True)
 class KeyInfo:
-    """A key of the configuration: its allowed values, its unit (empty if it has none), and its meaning."""
+    """A key of the configuration: its allowed values, its unit (empty if it has none), and its meaning.
+
+    ``choices`` are all values that it can have, if these are some words; else it is empty.
+    """
 
     key: Key
     default: Any
     allowed: str
+    choices: tuple[str, ...]
     unit: str
     description: str
 
@@ -67,7 +71,8 @@ def key_info(model: type[BaseModel], above: Key = ()) -> Iterator[KeyInfo]:
             yield from key_info(inner, (*above, name))
         else:
             default = field.get_default(call_default_factory=True, validated_data={})
-            yield KeyInfo((*above, name), default, allowed(field), unit(name), field.description or "")
+            choices = get_args(field.annotation) if get_origin(field.annotation) is Literal else ()
+            yield KeyInfo((*above, name), default, allowed(field), choices, unit(name), field.description or "")
 
 
 def blank_file(model: type[BaseModel]) -> str:

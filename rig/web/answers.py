@@ -334,7 +334,8 @@ class Calibrations(BaseModel):
 class Setting(BaseModel):
     """A key of the configuration: ``value`` is in force, ``saved`` is that of the file; null if it has none.
 
-    ``editable`` says whether a page may change it.
+    ``editable`` says whether a page may change it. ``choices`` are all its values, if these are some words; else it is
+    empty.
     """
 
     key: str
@@ -342,6 +343,7 @@ class Setting(BaseModel):
     saved: Any
     default: Any
     allowed: str
+    choices: list[str]
     unit: str
     description: str
     editable: bool

@@ -117,8 +117,8 @@ function typed(field, key) {
   if (text === "" || text === "none") return null;
   if (typeof key.default === "boolean") return text === "true";
   const numbers = text.split(",").map(Number);
-  if (Array.isArray(key.default) && numbers.every((one) => !Number.isNaN(one))) return numbers;
-  return key.allowed.includes("number") && !Number.isNaN(Number(text)) ? Number(text) : text;
+  if (typeof key.default === "string" || numbers.some(Number.isNaN)) return text;
+  return Array.isArray(key.default) || numbers.length > 1 ? numbers : numbers[0];
 }
 
 if ($("settings")) {
@@ -140,14 +140,16 @@ if ($("settings")) {
   const row = (key) => {
     const now = key.saved ?? key.value;
     const id = `set-${key.key}`;
-    const field = typeof key.default === "boolean"
-      ? h("select", { id }, ...["true", "false"].map((one) => h("option", { value: one, selected: String(now) === one }, one === "true" ? "yes" : "no")))
+    const choices = typeof key.default === "boolean" ? [["true", "yes"], ["false", "no"]] : key.choices.map((one) => [one, one]);
+    const field = choices.length
+      ? h("select", { id }, ...choices.map(([value, words]) => h("option", { value, selected: String(now) === value }, words)))
       : h("input", { id, value: shown(now) });
+    const allowed = choices.length ? "" : `${key.allowed}${key.unit ? `, in ${key.unit}` : ""}; `;
     field.disabled = !key.editable || !canOperate();
     field.addEventListener("change", () => save(key, typed(field, key)));
     const waits = key.saved !== null && !same(key.saved, key.value);
     return h("div", { class: `setting${same(now, key.default) ? "" : " changed"}` },
-      h("div", {}, h("label", { for: id }, h("strong", {}, key.key.split(".").at(-1).replaceAll("_", " "))), h("p", { class: "small" }, key.description), h("p", { class: "small soft" }, `${key.allowed}${key.unit ? `, in ${key.unit}` : ""}; default ${shown(key.default)}${key.editable ? "" : "; changed at the bench's computer"}`), waits && h("p", { class: "small error" }, `In force now: ${shown(key.value)}. The new value counts after the server starts again.`)),
+      h("div", {}, h("label", { for: id }, h("strong", {}, key.key.split(".").at(-1).replaceAll("_", " "))), h("p", { class: "small" }, key.description), h("p", { class: "small soft" }, `${allowed}default ${shown(key.default)}${key.editable ? "" : "; changed at the bench's computer"}`), waits && h("p", { class: "small error" }, `In force now: ${shown(key.value)}. The new value counts after the server starts again.`)),
       h("div", { class: "row" }, field, key.editable && !same(now, key.default) && h("button", { class: "link", "aria-label": `Reset ${key.key}`, onclick: () => save(key, key.default) }, "Reset")));
   };
   const render = () => {
