@@ -63,7 +63,7 @@ $("dial").addEventListener("keydown", (event) => {
   const step = { ArrowLeft: 5, ArrowUp: 5, ArrowRight: -5, ArrowDown: -5, PageUp: 45, PageDown: -45 }[event.key];
   if (step) aim((wanted ?? Math.round((tableDeg ?? 0) / 5) * 5) + step);
   else if (event.key === "Enter" && wanted !== null) rotateTo(wanted);
-  else if (event.key === "Escape") aim(null);
+  else if (event.key === "Escape" && wanted !== null) aim(null);
   else return;
   event.preventDefault();
 });

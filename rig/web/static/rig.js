@@ -25,6 +25,24 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
+/**
+ * Replace the children of an element. A child that stays as it is remains the same element, so that it keeps the focus, a press
+ * that has begun, and what was typed; the focus of another one passes to its successor.
+ */
+export function update(element, ...children) {
+  const wanted = children.filter((child) => child !== null && child !== undefined && child !== false);
+  wanted.forEach((child, k) => {
+    const before = element.childNodes[k];
+    if (!before) return element.append(child);
+    if (before.isEqualNode(child)) return undefined;
+    const focused = before.contains(document.activeElement);
+    before.replaceWith(child);
+    if (focused) (child.matches("button, a") ? child : child.querySelector("button, a"))?.focus();
+    return undefined;
+  });
+  while (element.childNodes.length > wanted.length) element.lastChild.remove();
+}
+
 // -- words -------------------------------------------------------------------------------------------------------------
 
 /** Return a number as people read it, with a minus sign; without decimals, with the digits that it has. */
@@ -356,6 +374,10 @@ $("stop")?.addEventListener("click", () => {
   setTimeout(() => { if (pressedAt === mine) stopByRequest(); }, open ? SECOND_WAY_MS : 0);
   setTimeout(() => { if (pressedAt === mine) showStop(FIRST_AID, "failed"); }, WARN_MS);
 });
+// Escape is STOP, too, because the Tab key needs too long to reach the button. Where it has its usual meaning, that comes first.
+addEventListener("keydown", (event) => {
+  if (event.key === "Escape" && !event.defaultPrevented && !event.target.closest("dialog, select, [type=search], [type=date]")) $("stop")?.click();
+});
 
 on("job", (job) => {
   if (job.state === "running" && $("stop-state").querySelector(".confirmed")) $("stop-state").replaceChildren();
@@ -417,6 +439,7 @@ on("me", showProposals);
 /** Show a job in a box: progress, question, buttons and, unless the page shows it elsewhere, the outcome. */
 export function showJob(box, job, withOutcome = true) {
   if (!job) return box.replaceChildren();
+  const asked = box.querySelector(".question");
   const post = (what, body) => () => act(() => request("POST", `/jobs/${job.id}/${what}`, body));
   const parts = [];
   if (!isEnded(job) || withOutcome) parts.push(h("p", {}, h("strong", {}, jobTitle(job)), ` – ${STATES[job.state] || job.state}`));
@@ -428,11 +451,11 @@ export function showJob(box, job, withOutcome = true) {
   if (job.question) {
     const sample = job.question.takes_sample ? h("input", { "aria-label": "Sample", maxlength: 100, autocomplete: "off", onkeydown: (event) => { if (event.key === "Enter") post("answer", { choice: "continue", sample: event.target.value || null })(); } }) : null;
     const buttons = job.question.choices.map((choice) => h("button", { class: choice === "continue" ? "" : "quiet", onclick: () => post("answer", sample && choice === "continue" ? { choice, sample: sample.value || null } : { choice })() }, CHOICES[choice]));
-    parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), sample, h("p", {}, ...nextSteps(job.question.steps)), h("div", { class: "row" }, ...buttons)));
+    parts.push(h("div", { class: "question", "data-of": job.id }, h("p", {}, job.question.text), sample, h("p", {}, ...nextSteps(job.question.steps)), h("div", { class: "row" }, ...buttons)));
   }
   if (!isEnded(job) && job.state !== "proposed") {
     parts.push(
-      h("div", { class: "row" },
+      h("div", { class: "row", "data-of": job.id },
         job.state === "running" && h("button", { class: "quiet", onclick: post("pause") }, "Pause"),
         job.state === "paused" && h("button", { onclick: post("resume") }, "Resume"),
         h("button", { class: "quiet", onclick: post("cancel") }, job.request.watch ? "Finish" : "Cancel")),
@@ -440,9 +463,10 @@ export function showJob(box, job, withOutcome = true) {
   }
   if (withOutcome && job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
   if (withOutcome && job.error) parts.push(h("div", { class: "failure" }, h("p", { class: "error" }, job.error.detail), h("p", {}, ...nextSteps(job.error.steps)), h("p", { class: "small soft" }, `Error ${job.error.code}`)));
-  if (job.resume && withOutcome) parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
-  box.replaceChildren(...parts);
-  if (job.question?.takes_sample) box.querySelector(".question input").focus();
+  if (job.resume && withOutcome) parts.push(h("div", { class: "row", "data-of": job.id }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
+  update(box, ...parts);
+  const question = box.querySelector(".question");
+  if (question !== asked) question?.querySelector("input")?.focus();
   return undefined;
 }
 
@@ -513,8 +537,8 @@ export function listJobs(changed) {
     const chosen = jobs.get(open) || newestOf(newest);
     showJob($("job"), chosen);
     if (chosen) changed(chosen);
-    $("jobs").replaceChildren(
-      ...newest.slice(0, 8).map((job) => h("li", {}, h("button", { class: "link", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${STATES[job.state] || job.state}, ${when(job.created_utc)}, ${job.operator}`)),
+    update($("jobs"),
+      ...newest.slice(0, 8).map((job) => h("li", { "data-of": job.id }, h("button", { class: "link", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${STATES[job.state] || job.state}, ${when(job.created_utc)}, ${job.operator}`)),
     );
   };
   on("job", (job) => {
