@@ -1,4 +1,4 @@
-import { $, API, act, ask, at, canOperate, counted, dayOf, get, h, on, pager, percent, request, start, table, toast, when } from "./rig.js";
+import { $, API, act, ask, at, canOperate, counted, dayOf, get, h, on, pager, percent, personOf, request, start, table, toast, when } from "./rig.js";
 import { columnChart, lineChart, picture } from "./pictures.js";
 
 const DAYS = 14; // columns of the chart: more are too narrow for their numbers
@@ -12,7 +12,8 @@ let opened = false;
 
 const words = (one) => ({ found: one.object, ambiguous: `${one.object} or another`, unknown: "unknown object" }[one.outcome] || "no object");
 const kind = (one) => ({ found: "good", ambiguous: "amber", unknown: "amber" }[one.outcome] || "");
-const day = (one) => new Date(one.time_utc).toLocaleDateString("sv"); // year, month and day, of this place
+const dateOf = (time) => time.toLocaleDateString("sv"); // year, month and day, of this place
+const day = (one) => dateOf(new Date(one.time_utc));
 
 function matching() {
   const text = $("search").value.trim().toLowerCase();
@@ -34,7 +35,7 @@ function render() {
     one.outcome === "found" && one.confidence !== null ? percent(one.confidence) : "",
     one.views,
     when(one.time_utc),
-    one.operator,
+    personOf(one.operator),
     h("button", { class: "quiet", "aria-label": `Details of answer ${one.id}`, onclick: () => act(() => open(one)) }, "Details"),
   ]));
   if (!rows.length) $("answers").replaceChildren(h("tbody", {}, h("tr", {}, h("td", { class: "empty" }, "There is no answer yet. ", h("a", { href: "/identify" }, "Identify an object")))));
@@ -46,10 +47,11 @@ function charts() {
     const count = days.get(day(one)) || [0, 0];
     days.set(day(one), [count[0] + 1, count[1] + (one.outcome === "found" ? 0 : 1)]);
   }
-  const shown = [...days].sort().slice(-DAYS);
-  $("days").replaceChildren(columnChart(shown.map(([date, [all, other]]) => [date.slice(5).replace("-", "/"), all, other]), `Answers a day: ${shown.map(([date, [all, other]]) => `${date} ${all}, of them ${other} not found`).join("; ")}`));
+  const last = Array.from({ length: DAYS }, (_, k) => new Date(Date.now() - 86400000 * (DAYS - 1 - k)));
+  const shown = last.map((one) => [one.toLocaleDateString(undefined, { day: "numeric", month: "numeric" }), ...(days.get(dateOf(one)) || [0, 0])]);
+  $("days").replaceChildren(columnChart(shown, `Answers a day: ${shown.map(([date, all, other]) => `${date} ${all}, of them ${other} not found`).join("; ")}`));
   const scored = rows.filter((one) => one.outcome === "found" && one.score !== null && (!emptyTable || one.time_utc >= emptyTable)).reverse();
-  $("drift").replaceChildren(lineChart([{ name: "score", colour: "c0", points: scored.map((one, k) => [k, one.score]) }], { label: "Score of the found objects, in order" }));
+  $("drift").replaceChildren(lineChart([{ name: "score", colour: "c0", points: scored.map((one, k) => [k, one.score]) }], { label: "Score of the found objects, in order", zero: true }));
   $("drift-words").textContent = `Score of each found object${emptyTable ? ` since the empty-table image of ${when(emptyTable)}` : ""}. If it falls slowly, take the empty-table image again.`;
 }
 
@@ -67,7 +69,7 @@ async function open(one) {
   const pictures = h("div", { class: "pair" },
     one.image ? picture(`${API}/results/${one.id}/image?full=true`, "The first view", "First view") : h("p", { class: "soft" }, "No image was recorded."),
     one.object ? picture(`${API}/pose-picture?object=${at(one.object)}`, `${one.object} as enrolled`, one.object, " as enrolled") : h("span"));
-  const facts = h("p", { class: "small soft" }, [when(one.time_utc), one.operator, counted(one.views, "view"), one.sample && `sample ${one.sample}`, one.correction_reason && `corrected by ${one.corrected_by}: ${one.correction_reason}`].filter(Boolean).join(", "));
+  const facts = h("p", { class: "small soft" }, [when(one.time_utc), personOf(one.operator), counted(one.views, "view"), one.sample && `sample ${one.sample}`, one.correction_reason && `corrected by ${one.corrected_by}: ${one.correction_reason}`].filter(Boolean).join(", "));
   const checked = h("p", { class: "small", id: "checked", role: "status" });
   const check = async () => {
     checked.textContent = "Computing again …";
@@ -98,7 +100,7 @@ $("csv").addEventListener("click", () => {
   const columns = ["id", "time_utc", "sample", "outcome", "object", "confidence", "score", "views", "operator", "corrections", "correction_reason"];
   const cell = (value) => (/[",\n;]/.test(String(value ?? "")) ? `"${String(value).replaceAll('"', '""')}"` : String(value ?? ""));
   const text = [columns, ...matching().map((one) => columns.map((key) => one[key]))].map((line) => line.map(cell).join(",")).join("\r\n");
-  const link = h("a", { href: URL.createObjectURL(new Blob([`\ufeff${text}`], { type: "text/csv" })), download: `answers-${new Date().toLocaleDateString("sv")}.csv` });
+  const link = h("a", { href: URL.createObjectURL(new Blob([`\ufeff${text}`], { type: "text/csv" })), download: `answers-${dateOf(new Date())}.csv` });
   link.click();
   URL.revokeObjectURL(link.href);
 });

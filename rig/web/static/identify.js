@@ -3,6 +3,7 @@ import { pathDrawing, picture, posePicture, viewPicture } from "./pictures.js";
 import "./shelf.js";
 
 const SHOWN = 4; // candidates: more are unlikely, and push the steps out of sight
+const CHARTED = 5; // candidates of the chart
 const KEPT = 10;
 const EMPTY_TABLE = 606;
 
@@ -37,6 +38,8 @@ function play(found) {
 
 // -- the search, as its events tell it ------------------------------------------------------------------------------------
 
+const COLOURS = 8;
+const colours = new Map(); // of the candidates of a job: an object has the same one in the list and in the chart
 let search = null; // of the object on the table: views, steps, candidates
 let shown = null; // the answer that is large
 let ready = false; // whether events are new, not those of a page that was opened later
@@ -80,7 +83,11 @@ function take(event, job) {
     case "waiting": search.live = event.reason === "first-object" ? "Put an object on the table." : "Put the next object on the table."; break;
     case "frame_used": s.live = `Looks like ${event.name} …`; break;
     case "accepted": s.views.push({ number: event.picture, words: `${event.azimuth_deg.toFixed(0)}°` }); s.azimuths.push(event.azimuth_deg); break;
-    case "ranked": s.candidates = event.candidates; s.notEnrolled = event.decision?.not_enrolled ?? null; break;
+    case "ranked":
+      s.candidates = event.candidates;
+      s.notEnrolled = event.decision?.not_enrolled ?? null;
+      for (const { name } of event.candidates.slice(0, CHARTED)) if (!colours.has(name)) colours.set(name, `c${colours.size % COLOURS}`);
+      break;
     case "identified": keep({ ...event, picture: s.views.at(-1)?.number, search: s }, job); break;
     case "failed": keep({ event: "failed", outcome: "failed", error: event, search: s }, job); break;
     case "recorded": if (ready) act(showLast); break;
@@ -172,10 +179,10 @@ function showSearch() {
   const s = search;
   const candidates = s.candidates.slice(0, SHOWN);
   const best = Math.max(...candidates.map((one) => one.probability ?? one.score), s.notEnrolled ?? 0, 1e-9);
-  const rows = candidates.map((one, k) => h("li", { title: one.probability === null ? `score ${one.score.toFixed(3)}` : percent(one.probability) },
+  const rows = candidates.map((one) => h("li", { title: one.probability === null ? `score ${one.score.toFixed(3)}` : percent(one.probability) },
     h("img", { src: posePicture(one.name, Math.round(one.pose_deg / 15) * 15), alt: "" }),
-    h("div", { class: `c${k}` }, h("span", {}, one.name), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
-  if (s.notEnrolled !== null) rows.push(h("li", { title: percent(s.notEnrolled) }, h("span", { class: "none", "aria-hidden": "true" }, "?"), h("div", { class: "soft" }, h("span", {}, "none of the enrolled objects"), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * s.notEnrolled) / best}%` })))));
+    h("div", { class: colours.get(one.name) }, h("span", {}, one.name), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
+  if (s.notEnrolled !== null) rows[s.notEnrolled === best ? "unshift" : "push"](h("li", { title: percent(s.notEnrolled) }, h("span", { class: "none", "aria-hidden": "true" }, "?"), h("div", { class: "soft" }, h("span", {}, "none of the enrolled objects"), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * s.notEnrolled) / best}%` })))));
   $("candidates").replaceChildren(...rows);
   $("way").replaceChildren(pathDrawing(s.azimuths.slice(-9)));
   $("steps").replaceChildren(...s.steps.slice(-12).map((step) => h("li", { class: step.soft ? "soft" : "" }, step.words)));
@@ -223,6 +230,7 @@ followJob(["identify"], {
     job = next;
     ready = false;
     [shown, twinOf] = [null, ""];
+    colours.clear();
     newSearch();
   },
   event: take,

@@ -186,7 +186,7 @@ export function columnChart(rows, label) {
     return [
       h("rect", { x, y: 104 - tall, width: width * 0.7, height: tall, rx: 3, fill: "currentColor", class: "c0" }),
       share > 0 && h("rect", { x, y: 104 - (90 * share) / most, width: width * 0.7, height: (90 * share) / most, rx: 3, fill: "currentColor", class: "c1" }),
-      h("text", { x: x + width * 0.35, y: 98 - tall, "text-anchor": "middle", class: "small" }, String(value)),
+      h("text", { x: x + width * 0.35, y: 98 - tall, "text-anchor": "middle", class: "small" }, value ? String(value) : ""),
       h("text", { x: x + width * 0.35, y: 120, "text-anchor": "middle", class: "axis" }, name),
     ].filter(Boolean);
   });

@@ -1,5 +1,5 @@
 // Calibrations, log, settings and tokens: each part runs on the page that has its element.
-import { $, act, ask, at, canOperate, counted, dayOf, followJob, get, h, number, on, pager, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
+import { $, act, ask, at, canOperate, counted, dayOf, followJob, get, h, number, on, pager, personOf, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
 
 // -- calibrations -----------------------------------------------------------------------------------------------------------
 
@@ -67,7 +67,7 @@ if ($("log")) {
       const day = dayOf(entry.time_utc);
       if (day !== lastDay) $("log").append(h("li", { style: "display: block" }, h("h2", {}, day)));
       lastDay = day;
-      const who = entry.details.operator && entry.details.operator !== "local" ? entry.details.operator : entry.user;
+      const who = personOf(entry.details.operator || "") || entry.user;
       $("log").append(h("li", {}, h("time", { datetime: entry.time_utc }, timeOf(entry.time_utc)), h("div", {}, h("strong", {}, who), ` ${(SENTENCES[entry.action] || (() => `${entry.action} ${entry.object_name || ""}`))(entry)}.`)));
     }
     if (!$("log").children.length) $("log").append(h("li", { class: "empty" }, "Nothing has happened yet."));
@@ -175,10 +175,10 @@ if ($("settings")) {
   on("hello", () => act(load));
   on("me", () => {
     const { name, role } = whoami();
-    $("you").textContent = `User ${name}. You may ${ROLES[role]}.`;
-    $("logout").hidden = name === "local";
+    $("you").textContent = `${personOf(name) ? `User ${name}.` : "No login is needed here."} You may ${ROLES[role]}.`;
+    $("logout").hidden = !personOf(name);
     $("tokens-section").hidden = !canOperate();
-    $("make-token").hidden = name === "local"; // then also the other users of this computer need no token
+    $("make-token").hidden = !personOf(name); // then also the other users of this computer need no token
     if (canOperate()) act(loadTokens);
   });
   $("logout").addEventListener("click", () => act(async () => { await request("POST", "/logout"); location.assign("/login"); }));

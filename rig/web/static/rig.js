@@ -63,6 +63,9 @@ export function percent(probability) {
 /** Return "a, b or c". */
 export const either = (words) => (words.length < 2 ? words.join("") : `${words.slice(0, -1).join(", ")} or ${words.at(-1)}`);
 
+/** Return the name of an operator; none for a person at the bench's own computer, who needs no login. */
+export const personOf = (name) => (name === "local" ? "" : name);
+
 /** Return a time as people read it: "43 s", "2 min 05 s", "1 h 20 min". */
 export function duration(seconds) {
   const s = Math.round(seconds);
@@ -306,7 +309,7 @@ async function loadMe() {
 
 function showLease(lease) {
   const mine = lease.client === CLIENT && lease.holder === me.name;
-  $("lease").textContent = mine ? `You operate (${me.name})` : lease.holder ? `${lease.holder} operates` : "No operator";
+  $("lease").textContent = mine ? `You operate${personOf(me.name) && ` (${me.name})`}` : lease.holder ? `${personOf(lease.holder) || "Another browser"} operates` : "No operator";
   $("lease-button").hidden = !canOperate();
   $("lease-button").textContent = mine ? "Release" : "Operate";
   $("lease-button").setAttribute("aria-label", mine ? "Release the bench" : "Operate the bench");
@@ -316,7 +319,7 @@ function showLease(lease) {
 on("lease", (lease) => {
   if (me === null) return;
   showLease(lease);
-  if (lease.taken_from && lease.taken_from.name === me.name && lease.taken_from.client === CLIENT) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, steps: ["You can watch."] }));
+  if (lease.taken_from && lease.taken_from.name === me.name && lease.taken_from.client === CLIENT) show(new Problem({ detail: `${personOf(lease.holder) || "Another browser"} has taken over the bench.`, steps: ["You can watch."] }));
 });
 
 async function offerLease() {
@@ -538,7 +541,7 @@ export function listJobs(changed) {
     showJob($("job"), chosen);
     if (chosen) changed(chosen);
     update($("jobs"),
-      ...newest.slice(0, 8).map((job) => h("li", { "data-of": job.id }, h("button", { class: "link", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${STATES[job.state] || job.state}, ${when(job.created_utc)}, ${job.operator}`)),
+      ...newest.slice(0, 8).map((job) => h("li", { "data-of": job.id }, h("button", { class: "link", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${[STATES[job.state] || job.state, when(job.created_utc), personOf(job.operator)].filter(Boolean).join(", ")}`)),
     );
   };
   on("job", (job) => {
