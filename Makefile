@@ -52,7 +52,7 @@ test-kills: $(READY) $(LIBRARY)
 # This needs Debian's chromium. The packages of these tests are large, so only this target installs them.
 test-web: $(READY) $(LIBRARY)
 	@sh .ci/install .ci/browser.lock
-	@$(BIN)/python -m pytest -rs -m "" --timeout 300 tests/browser
+	@$(BIN)/python -m pytest -rs -m "" --timeout 900 tests/browser
 
 # This installs nothing. docs/how-to/test-with-real-drivers.md explains how to get the kernel (docs/decisions/0001).
 KERNEL_FOLDER := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/hbr-rig/kernel

@@ -23,6 +23,7 @@ pytest.importorskip("fastapi", reason="the extra hbr-rig[web] is not installed")
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 CLOCK = SystemClock()
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+WAIT_S = 120  # for what takes a second on an idle computer
 
 
 @dataclass
@@ -44,7 +45,7 @@ def call(server: ServerProcess, path: str, body: Any = None, method: str | None 
     request = urllib.request.Request(
         f"{server.url}api/v1/{path}", data, {"Content-Type": "application/json"}, method=method
     )
-    with urllib.request.urlopen(request, timeout=20) as answer:
+    with urllib.request.urlopen(request, timeout=WAIT_S) as answer:
         return json.load(answer)
 
 
@@ -112,10 +113,17 @@ def chromium(launch: Callable[..., Any]) -> Iterator[Any]:
     browser.close()
 
 
+def new_context(chromium: Any, **options: Any) -> Any:
+    """Return another browser window, with its own cookies and store, whose pages wait for long."""
+    context = chromium.new_context(**options)
+    context.set_default_timeout(1000 * WAIT_S)
+    return context
+
+
 @pytest.fixture
 def page(chromium: Any) -> Iterator[Any]:
     """A page that fails the test on a script error, or if it asks another server."""
-    context = chromium.new_context(viewport={"width": 1280, "height": 900})
+    context = new_context(chromium, viewport={"width": 1280, "height": 900})
     shown = context.new_page()
     problems: list[str] = []
     context.on("weberror", lambda error: problems.append(str(error.error)))

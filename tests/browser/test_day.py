@@ -6,12 +6,11 @@ import subprocess
 
 import pytest
 
-from tests.browser.conftest import RIG, call, wait_for
+from tests.browser.conftest import RIG, call, new_context, wait_for
 from tests.small import SMALL
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
 PHONE = {"width": 390, "height": 844}
-WAIT_MS = 60_000
 
 
 def enroll(page, server, name, views=8):
@@ -23,16 +22,16 @@ def enroll(page, server, name, views=8):
 
 
 def enrolled(page, name):
-    page.wait_for_selector(f"#said.found:has-text('{name} is enrolled')", timeout=WAIT_MS)
+    page.wait_for_selector(f"#said.found:has-text('{name} is enrolled')")
 
 
 def job_done(page, title, state="done"):
-    page.wait_for_selector(f"#job:has-text('{title} – {state}')", timeout=WAIT_MS)
+    page.wait_for_selector(f"#job:has-text('{title} – {state}')")
 
 
 def put(page, name):
     page.click(f".shelf button:has-text('{name}')")
-    page.wait_for_selector(f".shelf button[aria-pressed=true]:has-text('{name}')", timeout=WAIT_MS)
+    page.wait_for_selector(f".shelf button[aria-pressed=true]:has-text('{name}')")
 
 
 @pytest.mark.parametrize("viewport", [None, PHONE], ids=["desktop", "phone"])
@@ -58,16 +57,16 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     page.fill("#rows input[aria-label='name of teapo']", "teapot")  # the list can be corrected
     page.click("#tray-start")
     for name in ("mug-star", "teapot"):
-        page.wait_for_selector(f".question:has-text('put {name} (kitchen) on the table')", timeout=WAIT_MS)
+        page.wait_for_selector(f".question:has-text('put {name} (kitchen) on the table')")
         page.click(".question button:has-text('Continue')")
-    page.wait_for_selector("#said:has-text('The tray is enrolled')", timeout=WAIT_MS)
+    page.wait_for_selector("#said:has-text('The tray is enrolled')")
     assert page.locator("#rows .tag:has-text('enrolled')").count() == 2
     # Identify. After a reload of the page, answer, candidates and steps are still there.
     page.goto(f"{server.url}identify")
     page.fill("#sample", "S-1")
     page.click("#go")
     for _ in range(2):
-        page.wait_for_selector("#answer.found:has-text('mug-star')", timeout=WAIT_MS)
+        page.wait_for_selector("#answer.found:has-text('mug-star')")
         page.locator("#enrolled img").evaluate("(image) => image.decode()")
         assert "mug-star" in page.get_attribute("#enrolled img", "alt")
         page.wait_for_selector("#candidates li:has-text('mug-star')")
@@ -123,10 +122,10 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     rotated = page.get_attribute("#needle", "transform")
     assert rotated.startswith("rotate(-89")  # counter-clockwise from the top, as the table rotates seen from above
     page.click("#jog button:has-text('−5')")
-    page.wait_for_selector("#dial-text:has-text('84.')", timeout=WAIT_MS)
+    page.wait_for_selector("#dial-text:has-text('84.')")
     page.wait_for_selector("#move svg")
     page.click("#doctor")
-    page.wait_for_selector("#findings li:has-text('calibration')", timeout=WAIT_MS)
+    page.wait_for_selector("#findings li:has-text('calibration')")
     assert "in use" not in page.text_content("#findings")
     fits()
     for name in ("calibrations", "log", "settings"):
@@ -153,34 +152,34 @@ def test_first_contact_leads_from_an_empty_table_to_an_answer(page, serve_proces
     for name in ("lamp", "teapot", "lamp"):
         put(page, name)
         page.click("#go:not([disabled])")
-        page.wait_for_selector(f"#answer.found:has-text('my {name}')", timeout=WAIT_MS)
+        page.wait_for_selector(f"#answer.found:has-text('my {name}')")
     put(page, "radio")
     page.click("#go:not([disabled])")
-    page.wait_for_selector("#answer.unknown:has-text('Unknown object')", timeout=WAIT_MS)
+    page.wait_for_selector("#answer.unknown:has-text('Unknown object')")
     assert "sure" not in page.text_content("#answer-detail")
     page.click("rig-shelf button:has-text('Clear the table')")
     page.wait_for_selector("rig-shelf :text('The table is empty')")
     page.click("#go:not([disabled])")
-    page.wait_for_selector("#answer:has-text('No object on the table')", timeout=WAIT_MS)
+    page.wait_for_selector("#answer:has-text('No object on the table')")
     page.goto(server.url)
     page.click("rig-shelf button:has-text('Unplug the camera')")
-    page.wait_for_selector("#live.stale", timeout=WAIT_MS)
-    page.wait_for_selector("#live:not(.stale)", timeout=WAIT_MS)  # it is plugged in again
+    page.wait_for_selector("#live.stale")
+    page.wait_for_selector("#live:not(.stale)")  # it is plugged in again
 
 
 def test_stop_button_above_an_open_dialog_stops_the_table(page, serve_process):
     server = serve_process("bench.sim.speed=5", 'bench.sim.object="lamp"')
     enroll(page, server, "lamp", 24)
-    page.wait_for_selector("#thumbs img", timeout=WAIT_MS)
+    page.wait_for_selector("#thumbs img")
     page.goto(f"{server.url}object?name=lamp")
     page.click("#rename")
     page.wait_for_selector("dialog[open]")
     page.click("#stop")
-    page.wait_for_selector("#stop-state:has-text('Stopped')", timeout=WAIT_MS)
+    page.wait_for_selector("#stop-state:has-text('Stopped')")
     page.goto(f"{server.url}enroll")
-    page.wait_for_selector("#said:has-text('Interrupted')", timeout=WAIT_MS)
+    page.wait_for_selector("#said:has-text('Interrupted')")
     page.click("#said-detail button:has-text('Continue')")
-    page.wait_for_selector("#job progress", timeout=WAIT_MS)
+    page.wait_for_selector("#job progress")
 
 
 def test_watch_mode_names_one_object_after_the_other(page, serve_process):
@@ -193,10 +192,10 @@ def test_watch_mode_names_one_object_after_the_other(page, serve_process):
     assert page.is_disabled("#sample")
     page.click("#go")
     for name in ("lamp", "mug-star", "lamp"):
-        page.wait_for_selector(f"#answer.found:has-text('{name}')", timeout=WAIT_MS)
+        page.wait_for_selector(f"#answer.found:has-text('{name}')")
     assert page.locator("#last li").count() >= 2
     page.click("#job button:has-text('Finish')")
-    page.wait_for_selector("#job button", state="detached", timeout=WAIT_MS)
+    page.wait_for_selector("#job button", state="detached")
     assert page.locator("#answer.found").count() == 1  # the last answer stays
 
 
@@ -222,7 +221,7 @@ def test_answer_is_shown_beside_the_enrolled_object_that_looks_most_like_it(page
         ({"outcome": "ambiguous", "possible": ["mug-white", "mug-star"]}, "mug-white and mug-star differ most here"),
     ):
         open_with(**values)
-        page.wait_for_selector(f"#twin-title:has-text('{words}')", timeout=WAIT_MS)
+        page.wait_for_selector(f"#twin-title:has-text('{words}')")
         for image in page.locator("#twin img").all():
             image.evaluate("(image) => image.decode()")
         assert page.locator("#twin img").count() == 2
@@ -236,25 +235,25 @@ def test_answer_is_shown_beside_the_enrolled_object_that_looks_most_like_it(page
 def test_second_tab_is_the_same_operator_and_a_second_browser_takes_over(page, chromium, serve_process):
     server = serve_process("bench.sim.speed=4", 'bench.sim.object="lamp"')
     enroll(page, server, "lamp", 24)
-    page.wait_for_selector("#thumbs img", timeout=WAIT_MS)
+    page.wait_for_selector("#thumbs img")
     page.reload()  # in the middle of the job
-    page.wait_for_selector("#thumbs img", timeout=WAIT_MS)
+    page.wait_for_selector("#thumbs img")
     tab = page.context.new_page()
     tab.goto(f"{server.url}enroll")
     tab.wait_for_selector("#lease:has-text('You operate')")
     tab.click("#job button:has-text('Pause')")
-    tab.click("#job button:has-text('Resume')", timeout=WAIT_MS)
+    tab.click("#job button:has-text('Resume')")
     tab.close()
-    other = chromium.new_context().new_page()
+    other = new_context(chromium).new_page()
     other.goto(f"{server.url}enroll")
-    other.wait_for_selector("#thumbs img", timeout=WAIT_MS)
+    other.wait_for_selector("#thumbs img")
     other.wait_for_selector("#lease:has-text('operates')")
     other.click("#job button:has-text('Pause')")
     other.click("dialog button:has-text('Take over')")
     page.wait_for_selector("#messages:has-text('has taken over')")
     other.wait_for_selector("#lease:has-text('You operate')")
     other.click("#job button:has-text('Pause')")
-    page.wait_for_selector("#said-detail:has-text('Paused')", timeout=WAIT_MS)
+    page.wait_for_selector("#said-detail:has-text('Paused')")
     page.click("#job button:has-text('Resume')")
     page.click("dialog button:has-text('Take over')")
     other.wait_for_selector("#messages:has-text('has taken over')")
@@ -264,12 +263,12 @@ def test_second_tab_is_the_same_operator_and_a_second_browser_takes_over(page, c
 def test_server_killed_in_an_enrollment_loses_no_view(page, serve_process):
     server = serve_process("bench.sim.speed=5", 'bench.sim.object="lamp"')
     enroll(page, server, "lamp", 24)
-    page.wait_for_selector("#thumbs li:nth-child(3) img", timeout=WAIT_MS)
+    page.wait_for_selector("#thumbs li:nth-child(3) img")
     shown = page.locator("#thumbs img").count()
     server.kill(signal.SIGKILL)
     again = serve_process("bench.sim.speed=50", 'bench.sim.object="lamp"')
     page.goto(f"{again.url}enroll")
-    page.wait_for_selector("#said:has-text('Interrupted')", timeout=WAIT_MS)
+    page.wait_for_selector("#said:has-text('Interrupted')")
     page.goto(f"{again.url}catalog")
     text = page.text_content(".cards a:has-text('lamp')")
     assert int(text.split("interrupted, ")[1].split()[0]) >= shown
@@ -299,7 +298,7 @@ def test_login_is_needed_for_another_address(page, serve_process, tmp_path):
     page.wait_for_selector("#login-error:has-text('unknown')")
     page.fill("#token", token)
     page.click("#login button")
-    page.wait_for_selector("#state.good", timeout=WAIT_MS)
+    page.wait_for_selector("#state.good")
     page.click("#home")
     page.wait_for_selector("#messages:has-text('may only watch')")
     page.click(".shelf button >> nth=0")
@@ -346,10 +345,10 @@ def test_pages_pass_axe(page, serve_process):
     assert page.locator("#similar figure img").count() == 4
     page.goto(f"{server.url}identify")
     page.click("#go")
-    page.wait_for_selector("#answer.found, #answer.ambiguous, #answer.unknown", timeout=WAIT_MS)
+    page.wait_for_selector("#answer.found, #answer.ambiguous, #answer.unknown")
     page.goto(server.url)
     page.click("#doctor")
-    page.wait_for_selector("#findings li", timeout=WAIT_MS)
+    page.wait_for_selector("#findings li")
     found = {}
     for scheme in ("light", "dark"):
         page.emulate_media(color_scheme=scheme)
@@ -379,10 +378,10 @@ def test_search_in_motion_shows_its_frames_and_stop_ends_it_during_the_rotation(
         enrolled(page, name)
     page.goto(f"{server.url}identify")
     page.click("#go")
-    page.wait_for_selector("#answer:has-text('Searching …'), #answer:has-text('Looks like')", timeout=WAIT_MS)
+    page.wait_for_selector("#answer:has-text('Searching …'), #answer:has-text('Looks like')")
     page.click("#stop")
-    page.wait_for_selector("#stop-state:has-text('Stopped')", timeout=WAIT_MS)
-    page.wait_for_selector("#answer:has-text('Stopped')", timeout=WAIT_MS)
+    page.wait_for_selector("#stop-state:has-text('Stopped')")
+    page.wait_for_selector("#answer:has-text('Stopped')")
     assert page.locator("#answer.found").count() == 0
 
 

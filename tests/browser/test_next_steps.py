@@ -3,7 +3,6 @@
 import pytest
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
-WAIT_MS = 60_000
 
 
 def rotate(page, server, angle_deg):
@@ -19,10 +18,10 @@ def test_fault_is_acknowledged_on_any_page(page, serve_process, stored, tmp_path
     settings = ['bench.sim.faults=["jam@move0", "jam@move1"]']
     server = serve_process(*settings, *([] if stored else ["state_dir=none"]))
     rotate(page, server, 90)
-    page.wait_for_selector("#next-steps:has-text('Remove what blocks the table')", timeout=WAIT_MS)
+    page.wait_for_selector("#next-steps:has-text('Remove what blocks the table')")
     page.goto(f"{server.url}enroll")
     page.click("#next-steps button:has-text('Acknowledge the fault')")
-    page.wait_for_selector("#state:has-text('Ready')", timeout=WAIT_MS)
+    page.wait_for_selector("#state:has-text('Ready')")
     assert page.text_content("#next-steps") == ""
 
 
@@ -31,15 +30,13 @@ def test_errors_name_no_command_that_a_page_can_do(page, serve_process):
     page.goto(f"{server.url}enroll")
     page.fill("#name", "lamp")
     page.click("#go")
-    page.wait_for_selector(
-        "#said-detail a[href='/calibrations']:has-text('Run the calibration camera-time')", timeout=WAIT_MS
-    )
+    page.wait_for_selector("#said-detail a[href='/calibrations']:has-text('Run the calibration camera-time')")
     page.goto(f"{server.url}identify")
     page.click("#go")
-    page.wait_for_selector("#answer-detail a[href='/enroll']:has-text('Enroll an object')", timeout=WAIT_MS)
+    page.wait_for_selector("#answer-detail a[href='/enroll']:has-text('Enroll an object')")
     page.goto(server.url)
     page.click("#doctor")
-    page.wait_for_selector("#findings a[href='/calibrations']", timeout=WAIT_MS)
+    page.wait_for_selector("#findings a[href='/calibrations']")
     assert "rig calibrate" not in page.inner_text("body")
     page.evaluate(
         "async (steps) => (await import('/static/rig.js')).show({ message: 'No.', steps })",

@@ -12,14 +12,14 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.browser.conftest import RIG, call
+from tests.browser.conftest import RIG, WAIT_S, call
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
 
 
 def connect(server):
     place = urlsplit(server.url)
-    return socket.create_connection((place.hostname, place.port), timeout=30)
+    return socket.create_connection((place.hostname, place.port), timeout=WAIT_S)
 
 
 def finish(server, job):
@@ -60,7 +60,7 @@ def test_commands_of_the_terminal_work_beside_the_server(serve_process):
     base = ["--bench", "sim", *server.settings]
 
     def rig(*words):
-        return subprocess.run([*RIG, *words, *base], capture_output=True, text=True, timeout=60)
+        return subprocess.run([*RIG, *words, *base], capture_output=True, text=True, timeout=WAIT_S)
 
     status = rig("status")
     assert status.returncode == 0, status.stderr
@@ -86,9 +86,9 @@ def test_server_with_a_certificate_speaks_tls_only(serve_process, tmp_path):
     server = serve_process(options=("--certfile", str(certificate), "--keyfile", str(key)))
     assert server.url.startswith("https://")
     context = ssl.create_default_context(cafile=certificate)
-    with urllib.request.urlopen(f"{server.url}api/v1/health", context=context, timeout=20) as answer:
+    with urllib.request.urlopen(f"{server.url}api/v1/health", context=context, timeout=WAIT_S) as answer:
         assert json.load(answer)["status"] == "ok"
     with pytest.raises(OSError):  # noqa: PT011 - reset or bad response, as the system likes
-        urllib.request.urlopen(server.url.replace("https", "http"), timeout=20)
+        urllib.request.urlopen(server.url.replace("https", "http"), timeout=WAIT_S)
     status = subprocess.run([*RIG, "status", "--bench", "sim", *server.settings], capture_output=True, text=True)
     assert f"served at {server.url}" in status.stdout, status.stderr

@@ -14,13 +14,12 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.browser.conftest import CLOCK, RIG, call, wait_for
+from tests.browser.conftest import CLOCK, RIG, WAIT_S, call, new_context, wait_for
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
 PAGES = ("settings", "identify", "catalog", "calibrations", "runs", "log")
-WAIT_MS = 30_000
-SLOW = ("bench.sim.speed=1", "table.velocity_dps=20")
-"""A rotation by 350° that takes 18 s: longer than any of these tests waits for a stop."""
+SLOW = ("bench.sim.speed=1", "table.velocity_dps=4")
+"""A rotation by 350° that takes 90 s: longer than any of these tests waits for a stop, also on a busy computer."""
 
 
 def rotate(server: Any, angle_deg: float = 350.0) -> str:
@@ -72,67 +71,67 @@ def ended(pid: int) -> bool:
 
 def test_stop_on_the_sixth_page_with_the_back_forward_cache(chromium, serve_process):
     server = serve_process(*SLOW)
-    page = chromium.new_context().new_page()
+    page = new_context(chromium).new_page()
     for name in PAGES:
         page.goto(f"{server.url}{name}")
-        page.wait_for_selector("#state.good", timeout=WAIT_MS)
+        page.wait_for_selector("#state.good")
     job = rotate(server)
     page.click("#stop")
-    page.wait_for_selector("#stop-state .confirmed", timeout=WAIT_MS)
+    page.wait_for_selector("#stop-state .confirmed")
     stopped(server, job)
     page.evaluate("history.back()")  # from the cache: it gets its events again
     page.wait_for_url("**/runs", wait_until="commit")
-    page.wait_for_selector("#state.good", timeout=WAIT_MS)
+    page.wait_for_selector("#state.good")
     job = rotate(server)
     page.click("#stop")
-    page.wait_for_selector("#stop-state .confirmed", timeout=WAIT_MS)
+    page.wait_for_selector("#stop-state .confirmed")
     stopped(server, job)
 
 
 def test_stop_in_each_of_six_tabs_of_the_bench(chromium, serve_process):
     server = serve_process(*SLOW)
-    context = chromium.new_context()
+    context = new_context(chromium)
     tabs = [context.new_page() for _ in range(6)]
     for tab in tabs:
         tab.goto(server.url)
     for tab in tabs:
         tab.bring_to_front()
-        tab.wait_for_selector("#live-image[src^='blob:']", timeout=WAIT_MS)
+        tab.wait_for_selector("#live-image[src^='blob:']")
     for tab in (tabs[-1], tabs[0]):
         job = rotate(server)
         tab.bring_to_front()
         tab.click("#stop")
-        tab.wait_for_selector("#stop-state .confirmed", timeout=WAIT_MS)
+        tab.wait_for_selector("#stop-state .confirmed")
         stopped(server, job)
 
 
 def test_page_warns_after_a_second_if_the_bench_does_not_confirm(chromium, serve_process):
     server = serve_process(*SLOW)
-    page = chromium.new_context().new_page()
+    page = new_context(chromium).new_page()
     page.goto(server.url)
-    page.wait_for_selector("#state.good", timeout=WAIT_MS)
+    page.wait_for_selector("#state.good")
     server.process.send_signal(signal.SIGSTOP)  # the process that owns the bench hangs
     try:
         page.click("#stop")
-        page.wait_for_selector("#stop-state .failed:has-text('NOT STOPPED: switch off the supply')", timeout=WAIT_MS)
+        page.wait_for_selector("#stop-state .failed:has-text('NOT STOPPED: switch off the supply')")
     finally:
         server.process.send_signal(signal.SIGCONT)
-    page.wait_for_selector("#stop-state .confirmed", timeout=WAIT_MS)  # it has carried out the stop now
+    page.wait_for_selector("#stop-state .confirmed")  # it has carried out the stop now
 
 
 def test_picture_without_successors_is_marked(chromium, serve_process):
     server = serve_process("bench.sim.speed=1")
-    page = chromium.new_context().new_page()
+    page = new_context(chromium).new_page()
     page.goto(server.url)
-    page.wait_for_selector("#live-image[src^='blob:']", timeout=WAIT_MS)
-    page.wait_for_selector("#live-age", state="hidden", timeout=WAIT_MS)
+    page.wait_for_selector("#live-image[src^='blob:']")
+    page.wait_for_selector("#live-age", state="hidden")
     server.process.send_signal(signal.SIGSTOP)
     try:
-        page.wait_for_selector("#live.stale", timeout=WAIT_MS)
+        page.wait_for_selector("#live.stale")
         assert "no new one comes" in page.text_content("#live-age")
     finally:
         server.process.send_signal(signal.SIGCONT)
-    page.wait_for_selector("#live-age", state="hidden", timeout=WAIT_MS)
+    page.wait_for_selector("#live-age", state="hidden")
 
 
 # -- other programs ----------------------------------------------------------------------------------------------------
@@ -143,7 +142,7 @@ def test_rig_stop_also_cancels_the_queue_of_the_server(serve_process):
     first = rotate(server)
     second = call(server, "jobs", {"kind": "goto", "angle_deg": -350})["id"]
     done = subprocess.run(
-        [*RIG, "stop", "--bench", "sim", *server.settings], capture_output=True, text=True, timeout=60
+        [*RIG, "stop", "--bench", "sim", *server.settings], capture_output=True, text=True, timeout=WAIT_S
     )
     assert done.returncode == 0, done.stderr
     stopped(server, first)
