@@ -40,8 +40,8 @@ from rig.cli.main import main
 main()
 """
 CLOCK = SystemClock()
+USUAL = os.getpriority(os.PRIO_PROCESS, 0)
 PAGES = ("settings", "identify", "catalog", "calibrations", "runs", "log")
-VIEWS = 36
 EXPORTS = """
 import sys, threading, urllib.request
 def export():
@@ -86,7 +86,7 @@ def words(seconds: list[float]) -> str:
 
 def usual_priority() -> None:
     """Called in a new process before its program begins."""
-    os.setpriority(os.PRIO_PROCESS, 0, 0)
+    os.setpriority(os.PRIO_PROCESS, 0, USUAL)
 
 
 @contextmanager
@@ -105,10 +105,11 @@ def busy(number: int) -> Iterator[None]:
 class ServedBench:
     """A served bench whose servo has a log."""
 
-    def __init__(self, folder: Path, url: str, token: str) -> None:
+    def __init__(self, folder: Path, url: str, token: str, pid: int) -> None:
         self.folder = folder
         self.url = url
         self.token = token
+        self.pid = pid
         self.state = folder / "state" / "sim-bench"
         self.failed_starts = 0
 
@@ -145,7 +146,8 @@ class ServedBench:
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[ServedBench]:
+def served(folder: Path, objects: tuple[str, ...] = ("lamp",), views: int = 36) -> Iterator[ServedBench]:
+    """Serve a bench with enrolled objects; the last one is on its table."""
     home = folder / "bench"
     log = folder / "bench" / "torque.log"
     simulated = subprocess.Popen(
@@ -157,7 +159,10 @@ def served(folder: Path) -> Iterator[ServedBench]:
     simulated.stdout.readline()
     log.symlink_to(folder / "torque.log")
     base = ["--config", str(home / "rig.toml"), "--set", f"catalog.path={folder}/catalog"]
-    subprocess.run([*RIG, "sim-bench", "put", "lamp", "--folder", str(home)], check=True, capture_output=True)
+    for name in objects:  # on a bench with a clock of its own: this takes less time than on that of real time
+        words = ["--bench", "sim", "--set", f"bench.sim.object={name}", "--views", str(views)]
+        subprocess.run([*RIG, "enroll", name, *base, *words], check=True, capture_output=True)
+    subprocess.run([*RIG, "sim-bench", "put", objects[-1], "--folder", str(home)], check=True, capture_output=True)
     made = subprocess.run(
         [*RIG, "serve", *base, "--new-token", "operator", "--role", "operate"],
         check=True,
@@ -174,13 +179,12 @@ def served(folder: Path) -> Iterator[ServedBench]:
     assert server.stderr is not None
     url = next(found.group() for line in server.stderr if (found := re.search(r"http://\S+/", line)))
     threading.Thread(target=server.stderr.read, daemon=True).start()
-    bench = ServedBench(home, url, token)
+    bench = ServedBench(home, url, token, server.pid)
     try:
-        for request in ({"kind": "reference", "here": True}, {"kind": "enroll", "name": "lamp", "views": VIEWS}):
-            job = bench.call("jobs", request)
-            while (job := bench.call(f"jobs/{job['id']}"))["state"] not in ("done", "failed"):
-                CLOCK.sleep(0.2)
-            assert job["state"] == "done", job["error"]
+        job = bench.call("jobs", {"kind": "reference", "here": True})
+        while (job := bench.call(f"jobs/{job['id']}"))["state"] not in ("done", "failed"):
+            CLOCK.sleep(0.2)
+        assert job["state"] == "done", job["error"]
         yield bench
     finally:
         for process in (server, simulated):
