@@ -23,7 +23,7 @@ from playwright.sync_api import sync_playwright
 
 HERE = Path(__file__).parent
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
-WAIT_MS = 120_000
+WAIT_MS = 600_000  # on a busy computer
 DESKTOP = {"width": 1366, "height": 768}
 PHONE = {"width": 390, "height": 844}
 SIZES = ((1920, 1080), (1366, 768), (1024, 768), (768, 1024), (390, 844))
@@ -38,6 +38,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         page = browser.new_page(viewport=DESKTOP)
+        page.set_default_timeout(WAIT_MS)
         with served(folder, "bench.sim.speed=20") as url:
             photograph(page, url, None if options.every else HERE)
             if options.every:
@@ -51,7 +52,7 @@ def main() -> None:
             with served(folder, jam, f"state_dir={folder}/jammed", 'serve.benches.left="http://127.0.0.1:9"') as url:
                 submit(url, kind="goto", angle_deg=90)
                 page.goto(url)
-                page.wait_for_selector("#next-steps button", timeout=WAIT_MS)
+                page.wait_for_selector("#next-steps button")
                 every(page, url, ("", "identify", "benches", "login"), options.every, "fault-")
         browser.close()
 
@@ -85,7 +86,7 @@ def every(page: Any, url: str, names: tuple[str, ...], folder: Path, prefix: str
         page.wait_for_timeout(2000)
         if not name and not prefix:
             page.click("#doctor")
-            page.wait_for_selector("#findings li", timeout=WAIT_MS)
+            page.wait_for_selector("#findings li")
             page.click("#camera summary")
         page.evaluate("scrollTo(0, 0)")
         for width, height in SIZES:
@@ -120,7 +121,7 @@ def photograph(page: Any, url: str, folder: Path | None) -> None:
 
     page.goto(url)
     page.click("#tour .now button")
-    page.wait_for_selector("#job:has-text('Empty-table image – done')", timeout=WAIT_MS)
+    page.wait_for_selector("#job:has-text('Empty-table image – done')")
     put("mug-white")
     page.wait_for_selector("#tour .now:has-text('Enroll it')")
     take("bench", from_px=420)
@@ -130,15 +131,15 @@ def photograph(page: Any, url: str, folder: Path | None) -> None:
         page.fill("#name", name)
         page.click("#go:not([disabled])")
         if name == "teapot":
-            page.wait_for_selector("#views-title:has-text('15 views')", timeout=WAIT_MS)
+            page.wait_for_selector("#views-title:has-text('15 views')")
             take("enroll")
-        page.wait_for_selector(f"#said:has-text('{name} is enrolled')", timeout=WAIT_MS)
+        page.wait_for_selector(f"#said:has-text('{name} is enrolled')")
     page.goto(f"{url}identify")
     for name in ("lamp", "toy-car", "radio", "teapot", "mug-star"):
         put(name)
         page.click("#go:not([disabled])")
-        page.wait_for_selector("#answer.calm", timeout=WAIT_MS)
-        page.wait_for_selector("#answer.found, #answer.unknown", timeout=WAIT_MS)
+        page.wait_for_selector("#answer.calm")
+        page.wait_for_selector("#answer.found, #answer.unknown")
     take("identify")
     page.goto(f"{url}object?name=mug-star")
     page.wait_for_selector("#viewer .number")
@@ -151,8 +152,8 @@ def photograph(page: Any, url: str, folder: Path | None) -> None:
     page.goto(f"{url}identify")
     put("radio")
     page.click("#go")
-    page.wait_for_selector("#answer.calm", timeout=WAIT_MS)
-    page.wait_for_selector("#answer.unknown", timeout=WAIT_MS)
+    page.wait_for_selector("#answer.calm")
+    page.wait_for_selector("#answer.unknown")
     take("phone", "dark")
     page.set_viewport_size(DESKTOP)
 

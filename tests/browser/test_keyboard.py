@@ -3,7 +3,7 @@
 import pytest
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
-STOPS = 120  # places that Tab may pass before what is wanted: more are a page that nobody uses with the keyboard
+STOPS = 120  # places that Tab may pass before what is wanted: more are too many for a person
 UNSEEN = """() => {
   const one = document.activeElement;
   if (one === document.body) return null;
@@ -69,11 +69,10 @@ def keys(page):
 def test_day_at_the_bench_with_the_keyboard_alone(page, keys, serve_process, tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text("")
-    # Moves are counted by the views before them, and the live image may be one.
-    faults = 'bench.sim.faults=["jam@move0", "jam@move1"]'
+    faults = 'bench.sim.faults=["jam@move1+5s"]'  # the first move after the first live image
     server = serve_process("bench.sim.speed=50", "enroll.views=6", faults, options=("--config", str(file)))
     page.goto(server.url)
-    page.wait_for_selector("#state.good")
+    page.wait_for_selector("#live-image[src^='blob:']")
 
     # The table jams: acknowledge the fault.
     keys.skip()

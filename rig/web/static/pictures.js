@@ -181,13 +181,14 @@ export function lineChart(series, { label, unit = "", high = 150, zero = false }
 export function columnChart(rows, label) {
   const most = Math.max(1, ...rows.map(([, value]) => value));
   const width = 480 / Math.max(rows.length, 7);
+  const every = Math.ceil(rows.length / 7); // names of more columns would touch each other
   const parts = rows.flatMap(([name, value, share], k) => {
     const [x, tall] = [20 + k * width, (90 * value) / most];
     return [
       h("rect", { x, y: 104 - tall, width: width * 0.7, height: tall, rx: 3, fill: "currentColor", class: "c0" }),
       share > 0 && h("rect", { x, y: 104 - (90 * share) / most, width: width * 0.7, height: (90 * share) / most, rx: 3, fill: "currentColor", class: "c1" }),
       h("text", { x: x + width * 0.35, y: 98 - tall, "text-anchor": "middle", class: "small" }, value ? String(value) : ""),
-      h("text", { x: x + width * 0.35, y: 120, "text-anchor": "middle", class: "axis" }, name),
+      h("text", { x: x + width * 0.35, y: 120, "text-anchor": "middle", class: "axis" }, (rows.length - 1 - k) % every ? "" : name),
     ].filter(Boolean);
   });
   return h("svg", { viewBox: "0 -8 520 134", class: "chart", role: "img", "aria-label": label }, ...parts);
