@@ -145,7 +145,7 @@ def operate(bench: ServedBench, seconds: float) -> None:
 
 
 def listen(socket: Any, confirmations: "Queue[tuple[int, bool, int]]") -> None:
-    """Take what the server sends, as a page does: answers to STOP with their time, and events, which are not needed here."""
+    """Take what the server sends, as a page does: answers to STOP with their time; events are left."""
     for text in socket:
         message = json.loads(text)
         if message["kind"] == "stopped":
