@@ -104,5 +104,5 @@ def _threshold(ranked: Ranked, min_score: float | None) -> tuple[str, float | No
     """Return the value at which a search ends, or below which an object is unknown, and its words."""
     if ranked.decision is not None:
         least = ranked.decision.min_confidence
-        return f"{percent(least)} ends the search", least
+        return f"an object with {percent(least)} ends the search", least
     return (f"below {min_score:.3g} is unknown", min_score) if min_score is not None else ("", None)

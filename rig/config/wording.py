@@ -43,13 +43,13 @@ _KINDS: Mapping[Any, str] = {
 class KeyInfo:
     """A key of the configuration: its allowed values, its unit (empty if it has none), and its meaning.
 
-    ``choices`` are all values that it can have, if these are some words; else it is empty.
+    ``choices`` are all values that it can have, if these are a few; else it is empty.
     """
 
     key: Key
     default: Any
     allowed: str
-    choices: tuple[str, ...]
+    choices: tuple[str | int, ...]
     unit: str
     description: str
 

@@ -334,8 +334,7 @@ class Calibrations(BaseModel):
 class Setting(BaseModel):
     """A key of the configuration: ``value`` is in force, ``saved`` is that of the file; null if it has none.
 
-    ``editable`` says whether a page may change it. ``choices`` are all its values, if these are some words; else it is
-    empty.
+    ``editable`` says whether a page may change it. ``choices`` are its values as text if they are few, else empty.
     """
 
     key: str

@@ -125,7 +125,7 @@ def add_records(routes: Routes, server: Server) -> None:
                 key=info.name,
                 **masked({"value": info.value(config), "saved": info.value(written), "default": plain(info.default)}),
                 allowed=info.allowed,
-                choices=list(info.choices),
+                choices=[str(one) for one in info.choices],
                 unit=info.unit,
                 description=info.description,
                 editable=file is not None and _is_for_pages(info.name),

@@ -126,3 +126,6 @@ def test_settings_are_written_to_the_file_and_only_harmless_ones(serve, tmp_path
     assert keys["identify.max_views"]["editable"]
     assert not keys["servo.port"]["editable"]
     assert keys["camera.exposure_us"]["unit"] == "µs"
+    assert keys["enroll.mode"]["choices"] == ["auto", "step", "fly"]
+    assert keys["imu.sign"]["choices"] == ["1", "-1"]
+    assert keys["identify.max_views"]["choices"] == []
