@@ -44,8 +44,8 @@ RIVET_R = 95.5  # circle of the screws between deck and base
 HANGERS = [(x, y) for x in (-30.0, 30.0) for y in (-24.0, 24.0)]  # screws that carry the servo's plate
 HUB_R, HUB_SCREWS_R = 17.0, 13.9
 EXIT = (0.0, 83.0)  # where the cable leaves the drum through the deck
-INNER = (0.0, 31.0)  # where the cable is held below the platter
-CLIP = (26.0, 8.0, 3.0)
+INNER = (0.0, 32.0)  # where the cable is held below the platter
+CLIP = (29.0, 10.0, 3.0)
 CLIP_HOLES = 9.5  # of the clip's screws from its middle
 IMU_AT = (62.0, 0.0)
 CARD_HOLES = [(-18.0, -72.0), (18.0, -72.0)]  # of the home card's stand in the platter
@@ -87,6 +87,14 @@ def sunk(part: Part, holes: Iterable[tuple[float, float]], top: float, head: flo
     return part
 
 
+def sunk_in_bed(part: Part, holes: Iterable[tuple[float, float]]) -> Part:
+    """Return the part with holes for M3 screws whose heads are countersunk in the face that lies on the bed."""
+    part = drilled(part, holes, M3)
+    for x, y in holes:
+        part -= Pos(x, y, 0) * Cone(3.3, M3 / 2, 1.7, align=UP)
+    return part
+
+
 def around(radius: float, count: int, first_deg: float = 0.0) -> list[tuple[float, float]]:
     """Return places on a circle."""
     angles = [radians(first_deg + 360 / count * i) for i in range(count)]
@@ -111,11 +119,11 @@ def platter() -> Part:
     part += box(IMU["length"] + 8, IMU["width"] + 16, rim, (ix, iy, 0))
     # The IMU lies in a pocket that is open below, parts up, so that its z points up.
     part -= box(IMU["length"] + 2 * PLAY, IMU["width"] + 2 * PLAY, 9, (ix, iy, rim - IMU["height"] - 0.4))
-    part -= box(6, 8, 9, (ix - IMU["length"] / 2 - 3, iy, rim - 2.2))  # its wires
+    part -= box(
+        6, 8, 9, (ix - IMU["length"] / 2 - 3, iy, rim - IMU["height"] - 0.4)
+    )  # its wires, on the side of the parts
     part = drilled(part, [(ix, iy + side * (IMU["width"] / 2 + 4)) for side in (-1, 1)], TAP3, low=1.2)
-    part = drilled(part, around(HUB_SCREWS_R, 4, 45), M3)
-    for x, y in around(HUB_SCREWS_R, 4, 45):  # heads of countersunk screws, in the top
-        part -= Pos(x, y, 0) * Cone(3.3, M3 / 2, 1.7, align=UP)
+    part = sunk_in_bed(part, around(HUB_SCREWS_R, 4, 45))
     part += box(44, 8, rim, (0, CARD_HOLES[0][1], 0))
     part = drilled(part, CARD_HOLES, TAP3)
     part = drilled(part, clip_screws(INNER), TAP3, low=1.2)
@@ -141,9 +149,12 @@ def hub(servo: str) -> Part:
 
 
 def cable_clip() -> Part:
-    """A bar that presses the cable against platter or deck, printed with its groove up."""
+    """A bar that presses the cable against platter or deck, printed with its groove up.
+
+    Its screws are countersunk, because the cable in the drum winds close below their heads.
+    """
     part = box(*CLIP) - box(CABLE["width"] + 1, 20, 1, (0, 0, CLIP[2] - 0.7))
-    return drilled(part, [(-CLIP_HOLES, 0), (CLIP_HOLES, 0)], M3)
+    return sunk_in_bed(part, [(-CLIP_HOLES, 0), (CLIP_HOLES, 0)])
 
 
 def clip_screws(at: tuple[float, float]) -> list[tuple[float, float]]:

@@ -13,10 +13,11 @@ from build123d import GeomType, Pos, Rot
 from OCP.BRepAdaptor import BRepAdaptor_Surface
 
 from docs.hardware import parts, wiring
-from docs.hardware.assembly import camera_pivot, frame, home_place, table
+from docs.hardware.assembly import RAIL_Y, camera_pivot, frame, home_place, table
 from docs.hardware.mesh import normals, triangles
-from docs.hardware.parts import PLATTER_Z, SERVOS, TABLE, TOP_Z
+from docs.hardware.parts import PLATTER_Z, PROFILE, SERVOS, TABLE, TOP_Z
 from rig.config import RigConfig
+from rig.views.charuco_board import CharucoBoard
 from sim.calibration_board import home_mark
 from sim.optics import Optics
 from sim.servo.models import servo_model
@@ -240,7 +241,9 @@ def test_cable_fits_the_drum_at_both_limits():
     loose = cable["length"] / (2 * pi * (cable["turns"] + low / 360)) + layers
     assert tight > TABLE["bearing"]["outer"] / 2 + 3.15  # the wall around the bearing
     assert loose < parts.DRUM_R
-    assert cable["width"] < PLATTER_Z - parts.CLIP[2] - parts.DECK_Z - parts.DECK
+    free = PLATTER_Z - parts.DECK_Z - parts.DECK
+    assert cable["width"] < free - parts.CLIP[2]  # whose screws are countersunk
+    assert cable["width"] < free - 1.6 - 1.65  # IMU cover, and heads of ISO 7380
 
 
 def test_camera_stands_where_the_simulator_has_it():
@@ -272,6 +275,30 @@ def test_home_card_stands_where_the_simulator_has_it():
     (stand,) = (item.solid for item in table() if item.name == "stand of the home card")
     (card,) = (item.solid for item in table() if item.name == "home card")
     assert stand.distance_to(card) < 0.2
+
+
+def test_guide_has_the_numbers_of_the_parts():
+    guide = " ".join((DOCS / "how-to" / "build-the-table.md").read_text().split())
+    near, far = RAIL_Y
+    y, z = camera_pivot()
+    front = y - parts.PIVOT_OUT
+    own = SERVOS["xl430_w250"]
+    under = parts.HORN_Z - own["horn_height"]
+    board = CharucoBoard()
+    card = TABLE["home_card"]
+    for words in (
+        f"{far:.0f} mm from this end, and {-near:.0f} mm from the other one",
+        f"{-front:.0f} mm before the axis ({front - near:.0f} mm from the end of the rail)",
+        f"{z:.0f} mm above the desk at the pivot",
+        f"the lens is {parts.LENS[2]:.0f} mm above the desk and {-parts.LENS[1]:.0f} mm before the axis",
+        f"the plate hangs {parts.DECK_Z - under - parts.PLATE:.0f} mm below the deck",
+        f"Below the servo, {under - own['body'][2] - parts.BASE_Z - parts.FLOOR:.0f} mm are free",
+        f"plates {card['columns'] * 15 + 10} × {card['rows'] * 15 + 10} and "
+        f"{board.size_mm[0] + 10:.0f} × {board.size_mm[1] + 10:.0f} mm, {card['thickness']:.0f} mm thick",
+        f"profile 2020 with slot 6: {PROFILE['rail']:.0f}, {PROFILE['post']:.0f} and {PROFILE['bar']:.0f} mm",
+        f"Wind {TABLE['cable']['length'] / 10:.0f} cm of the ribbon",
+    ):
+        assert words in guide
 
 
 def test_wiring_diagram_is_that_of_the_code():
