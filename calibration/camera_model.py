@@ -51,6 +51,29 @@ def matrix_of(result: CalibrationResult) -> tuple["np.ndarray[tuple[int, int], n
     return matrix, [value[name] for name in ("k1", "k2", "p1", "p2")]
 
 
+def covariance(result: CalibrationResult) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+    """Return the covariance (8, 8) of the parameters: the stated uncertainties, and how the views correlate them.
+
+    The views determine some combinations far better than each parameter: a principal point that is too low, with a
+    tangential distortion and tilted boards, gives nearly the same corners. The poses of the board are eliminated from
+    the normal equations (the Schur complement), because only the camera stays the same.
+    """
+    matrix, distortion = matrix_of(result)
+    board = CharucoBoard(**result.evidence["board"])
+    normal = np.zeros((len(PARAMETERS), len(PARAMETERS)))
+    for view in result.evidence["views"]:
+        points_mm, corners = board.points_mm()[view["ids"]], np.array(view["corners_px"])
+        _, rotation, translation = cv2.solvePnP(points_mm, corners, matrix, np.array(distortion))
+        jacobian = cv2.projectPoints(points_mm, rotation, translation, matrix, np.array(distortion))[1]
+        of_pose, of_camera = jacobian[:, :6], jacobian[:, 6 : 6 + len(PARAMETERS)]
+        explained = of_pose @ np.linalg.lstsq(of_pose, of_camera, rcond=None)[0]
+        normal += of_camera.T @ (of_camera - explained)
+    inverse = np.linalg.inv(normal)
+    stated = np.array([result.estimates[name].uncertainty for name, _ in PARAMETERS])
+    scale = stated / np.sqrt(np.diag(inverse))
+    return np.asarray(scale[:, None] * inverse * scale)
+
+
 def plot(result: CalibrationResult) -> Chart | None:
     """Return a chart of the corners in the frame; each position of the board has its colour."""
     views = result.evidence["views"]

@@ -15,12 +15,13 @@ camera.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from math import degrees, hypot, radians, sqrt
+from math import degrees, hypot, radians
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from calibration import camera_model
@@ -53,6 +54,11 @@ CORNER_PX = 0.1
 """Uncertainty of a corner: it weighs the corners against the known camera parameters."""
 PIVOT_MM = 80.0
 """Typical distance of the bearing below the board's middle."""
+REST_DEG = 0.03
+"""Standard uncertainty of the table's angle at a rest: an encoder count of 0.088°, uniform, and its noise.
+
+It moves all corners of a view together, so more corners do not reduce it.
+"""
 BIAS_PX = 0.02
 """Common error of OpenCV's corners; more corners do not reduce it."""
 SQUARE_SIGMA_MM = 0.03  # ±0.05 mm of a caliper, uniform
@@ -214,8 +220,9 @@ class _Axis:
         self._views = views
         camera = [intrinsics.estimates[name] for name, _ in PARAMETERS]
         self._known = np.array([-PIVOT_MM, *(estimate.value for estimate in camera)])
-        self._known_sigma = np.array([PIVOT_MM / 2, *(estimate.uncertainty for estimate in camera)])
-        self._known_sigma[1:3] *= sqrt(2)  # both focal lengths have the same error, so they count once
+        # Rows that weigh the known values: of unit variance, and without correlation.
+        known = block_diag((PIVOT_MM / 2) ** 2, camera_model.covariance(intrinsics))
+        self._whiten = np.linalg.inv(np.linalg.cholesky(known))
         self._points = [points(board, view) for view in views]
         self._corners_px = np.concatenate([view.corners_px for view in views])
         self._middle, self._square_mm = board.points_mm().mean(axis=0), board.square_mm
@@ -270,6 +277,7 @@ class _Axis:
             for rows, variance in (
                 (solved.jac[:-known], float((residuals**2).sum()) / freedom),
                 (solved.jac[-known:], CORNER_PX**2),
+                (self._by_angle(solved.x, solved.jac), radians(REST_DEG) ** 2),
             )
         ]
         # Uncertainties of the reported quantities: their derivatives by the parameters, from differences.
@@ -293,10 +301,11 @@ class _Axis:
         return estimates, rms
 
     def _estimate(self, value: float, unit: str, sigma: Floats) -> Estimate:
-        """Return an estimate; ``sigma`` (2,) are the contributions of the corners and of the known values."""
+        """Return an estimate; ``sigma`` (3,) are the contributions of the corners, known values and table's angles."""
         budget = [
             Contribution("scatter of the corners about the fit", "A", float(sigma[0]), unit),
             Contribution("calibration of the camera, and height of the bearing", "B", float(sigma[1]), unit),
+            Contribution("angle of the encoder at a rest", "B", REST_DEG, "°", float(sigma[2]) / REST_DEG),
         ]
         if unit == "px":
             budget.append(Contribution("common error of all corners", "B", BIAS_PX, "px"))
@@ -304,6 +313,14 @@ class _Axis:
             scale = value / self._square_mm
             budget.append(Contribution("side of the board's squares, measured", "B", SQUARE_SIGMA_MM, "mm", scale))
         return Estimate(value, tuple(budget), unit)
+
+    def _by_angle(self, p: Floats, jacobian: Floats) -> Floats:
+        """Return how an error (rad) of the angle of each view acts on the normal equations, (views, parameters)."""
+        step = 1e-4
+        moved = (self._residuals(p, step) - self._residuals(p)) / step
+        ends = 2 * np.cumsum([len(part) for part in self._points])
+        parts = zip(np.split(moved, ends)[:-1], np.split(jacobian, ends)[:-1], strict=True)
+        return np.stack([by_parameter.T @ by_angle for by_angle, by_parameter in parts])
 
     def _solved(self, start: Floats, evaluations: int) -> Any:
         return least_squares(
@@ -330,19 +347,20 @@ class _Axis:
         beside = point + up * float((middle - point) @ up)
         return np.concatenate([beside, up, self._seen(beside[None], p)[0], [degrees(hypot(*lean))]])
 
-    def _residuals(self, p: Floats) -> Floats:
+    def _residuals(self, p: Floats, turned: float = 0.0) -> Floats:
+        """Return the residuals of corners and known values, with the table ``turned`` further (rad) in each view."""
         up, point, lean = self._geometry(p)
         parts = []
         for view, board_points in zip(self._views, self._points, strict=True):
             begin = FIRST_POSE + 6 * self._stands.index(view.stand)
             at_zero = board_points @ cv2.Rodrigues(p[begin : begin + 3])[0].T + p[begin + 3 : begin + 6]
-            angle = radians(view.table_deg)
+            angle = radians(view.table_deg) + turned
             c, s = np.cos(2 * angle), np.sin(2 * angle)
             leaning = (c * lean[0] - s * lean[1]) * self._across[0] + (s * lean[0] + c * lean[1]) * self._across[1]
             rotation = cv2.Rodrigues(leaning)[0] @ cv2.Rodrigues(up * angle)[0]
             parts.append(point + (at_zero - point) @ rotation.T)
         corners = (self._seen(np.concatenate(parts), p) - self._corners_px).ravel()
-        return np.concatenate([corners, CORNER_PX * (p[6:FIRST_POSE] - self._known) / self._known_sigma])
+        return np.concatenate([corners, CORNER_PX * self._whiten @ (p[6:FIRST_POSE] - self._known)])
 
 
 def pose(board: CharucoBoard, view: BoardView, matrix: Floats, distortion: Sequence[float]) -> tuple[Floats, Floats]:

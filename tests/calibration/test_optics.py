@@ -74,6 +74,35 @@ def test_true_axis_lies_within_the_stated_uncertainty(seed, wobble_deg):
     assert result.estimates["wobble"].value == pytest.approx(wobble_deg, abs=0.05)
 
 
+def test_cameras_that_differ_along_the_covariance_show_nearly_the_same_corners():
+    """With independent parameters, as uncertain each, they do not: the axis must use what the views know together."""
+    result = calibrated(0)
+    covariance = camera_model.covariance(result)
+    stated = [result.estimates[name].uncertainty for name, _ in camera_model.PARAMETERS]
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(stated)
+    values = np.array([result.estimates[name].value for name, _ in camera_model.PARAMETERS])
+    points, (matrix, distortion) = CharucoBoard().points_mm(), camera_model.matrix_of(result)
+
+    def changed_px(change: np.ndarray) -> float:
+        fx, fy, cx, cy, *other = values + change
+        camera = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        squares = []
+        for view in result.evidence["views"]:
+            ids, corners = view["ids"], np.array(view["corners_px"])
+            _, *pose = cv2.solvePnP(points[ids], corners, matrix, np.array(distortion))
+            before = cv2.projectPoints(points[ids], *pose, matrix, np.array(distortion))[0]
+            _, *pose = cv2.solvePnP(points[ids], before, camera, np.array(other))
+            after = cv2.projectPoints(points[ids], *pose, camera, np.array(other))[0]
+            squares.append(((after - before) ** 2).mean())
+        return float(np.sqrt(np.mean(squares)))
+
+    rng = np.random.default_rng(0)
+    together = [changed_px(change) for change in rng.multivariate_normal(np.zeros(8), covariance, 4)]
+    alone = [changed_px(rng.normal(0, stated)) for _ in range(4)]
+    assert np.mean(together) < 0.02
+    assert np.mean(together) < 0.3 * np.mean(alone)
+
+
 def test_region_of_interest_holds_the_rotating_object():
     true, room = optics(0), ObjectSpace(radius_mm=40.0, height_mm=100.0)
     views = seen(true, table_axis.STANDS[:1], table_axis.ANGLES_DEG)
