@@ -25,6 +25,8 @@ from rig.core.phrases import filled, in_unit, number
 
 # far above a result with all its evidence; a larger file is another one, and is not read into memory
 MAX_FILE_BYTES = 10_000_000
+COVERAGE_FACTOR = 2
+"""k of an expanded uncertainty: about 95 % of a normal distribution (JCGM 100:2008, 6.2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +68,8 @@ class Estimate:
 
     @property
     def expanded(self) -> str:
-        """The expanded uncertainty U = k·u with k = 2: about 95 % of a normal distribution (JCGM 100:2008, 6.2)."""
-        return in_unit(f"{2 * self.uncertainty:.2g}", self.unit) if self.uncertainty > 0 else ""
+        """The expanded uncertainty U = k·u in words; empty if the uncertainty is 0."""
+        return in_unit(f"{COVERAGE_FACTOR * self.uncertainty:.2g}", self.unit) if self.uncertainty > 0 else ""
 
     def __str__(self) -> str:
         """Return value and uncertainty to two digits of the uncertainty."""

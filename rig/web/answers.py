@@ -302,10 +302,41 @@ class LogRow(BaseModel):
     details: dict[str, Any]
 
 
-class CalibrationRow(BaseModel):
-    """A calibration that was run, with its worst ``residual`` and the ``limit`` for it, and its values in words.
+class BudgetRow(BaseModel):
+    """A source of an uncertainty budget: the ``contribution`` is its standard uncertainty times the ``sensitivity``.
 
-    ``id`` is the name by which a stored view refers to it.
+    The contribution is in the unit of the quantity.
+    """
+
+    source: str
+    kind: Literal["A", "B"]
+    uncertainty: float
+    unit: str
+    sensitivity: float
+    contribution: float
+
+
+class Quantity(BaseModel):
+    """A calibrated quantity with its standard ``uncertainty``, and the ``expanded`` one, which is ``k`` times as large.
+
+    ``text`` is value and standard uncertainty in words. The uncertainty is the root of the sum of the squared
+    contributions.
+    """
+
+    value: float
+    unit: str
+    text: str
+    uncertainty: float
+    k: float
+    expanded: float
+    budget: list[BudgetRow]
+
+
+class CalibrationRow(BaseModel):
+    """A calibration that was run, with its worst ``residual`` and the ``limit`` for it.
+
+    ``id`` is the name by which a stored view refers to it. It was compared with the ``reference``. If ``valid_until`` is
+    null, it is valid until a device changes.
     """
 
     id: str
@@ -315,9 +346,12 @@ class CalibrationRow(BaseModel):
     residual: float | None
     limit: float | None
     unit: str
-    valid_days: float | None
+    valid_until: Time | None
+    reference: str
+    operator: str
+    software: str
     rejections: list[str]
-    values: dict[str, str]
+    quantities: dict[str, Quantity]
 
 
 class Calibrations(BaseModel):

@@ -8,7 +8,8 @@ from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import Field
 
 from rig.bench.changes import set_key
-from rig.calibrations import CalibrationStore
+from rig.calibrations import CalibrationStore, Estimate
+from rig.calibrations.result import COVERAGE_FACTOR
 from rig.config import RigConfig
 from rig.config.toml_file import NONE, toml
 from rig.config.values import read_values
@@ -21,9 +22,11 @@ from rig.events.events import event_dict
 from rig.search.replay import ReplayCheck, check
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.answers import (
+    BudgetRow,
     CalibrationRow,
     Calibrations,
     ListOf,
+    Quantity,
     RunCheck,
     RunName,
     SavedRunBody,
@@ -99,9 +102,12 @@ def add_records(routes: Routes, server: Server) -> None:
                 residual=one.residual,
                 limit=one.limit,
                 unit=one.residual_unit,
-                valid_days=one.valid_days,
+                valid_until=one.valid_until,
+                reference=one.reference,
+                operator=one.operator,
+                software=one.software,
                 rejections=[str(reason) for reason in one.rejections],
-                values={key: str(value) for key, value in one.estimates.items()},
+                quantities={key: _quantity(value) for key, value in one.estimates.items()},
             )
             for one in store.history()
         ]
@@ -148,6 +154,18 @@ def add_records(routes: Routes, server: Server) -> None:
             return SettingChange(changed=set_key(file, key, NONE if body.value is None else toml(body.value)))
         except ConfigError as error:  # of this request, not of the server
             raise UsageError(error.what, next_step=error.steps, evidence=error.evidence) from error
+
+
+def _quantity(one: Estimate) -> Quantity:
+    return Quantity(
+        value=one.value,
+        unit=one.unit,
+        text=str(one),
+        uncertainty=one.uncertainty,
+        k=COVERAGE_FACTOR,
+        expanded=COVERAGE_FACTOR * one.uncertainty,
+        budget=[BudgetRow(**plain(source), contribution=source.part) for source in one.budget],
+    )
 
 
 def _is_for_pages(key: str) -> bool:

@@ -12,9 +12,24 @@ function residual(one) {
 
 /** Return when a result ends, in words. */
 function validity(one) {
-  if (!one.passed || one.valid_days === null) return "";
-  const left = one.valid_days - (Date.now() - Date.parse(one.when_utc)) / 86400000;
+  if (!one.passed || !one.valid_until) return "";
+  const left = (Date.parse(one.valid_until) - Date.now()) / 86400000;
   return left < 0 ? "expired" : `valid for ${counted(Math.ceil(left), "more day")}`;
+}
+
+/** Return what a result was compared with, by whom, and the uncertainty budget of each of its quantities. */
+function traceability(one) {
+  const facts = [["reference", one.reference], ["operator", one.operator], ["software", one.software], ["valid until", one.valid_until ? dayOf(one.valid_until) : "a device changes"]];
+  const short = (value, unit = "") => `${Number(value.toPrecision(2))} ${unit}`.trim();
+  const rows = Object.entries(one.quantities).flatMap(([name, of]) => of.budget.map((source, i) => [
+    i ? "" : `${name.replaceAll("_", " ")}: ${of.text}; U = ${short(of.expanded, of.unit)}`,
+    source.source, source.kind, short(source.uncertainty, source.unit), short(source.sensitivity), short(source.contribution), `${of.uncertainty ? Math.round(100 * (source.contribution / of.uncertainty) ** 2) : 0} %`,
+  ]));
+  const budget = h("table", { class: "small" });
+  table(budget, ["Quantity; U with k = 2", "Source of uncertainty", "Type", "u of the source", "Sensitivity", "Contribution", "Share"], rows);
+  return h("details", {}, h("summary", {}, "Uncertainty and reference"),
+    h("dl", { class: "values small" }, ...facts.flatMap(([name, words]) => [h("dt", {}, name), h("dd", {}, words)])),
+    h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Uncertainty budget of ${one.name}` }, budget));
 }
 
 if ($("calibrations")) {
@@ -25,12 +40,13 @@ if ($("calibrations")) {
       const results = newest.map((one) => h("div", {},
         h("p", {}, h("span", { class: `tag ${one.passed ? "good" : "bad"}` }, one.passed ? "passed" : "not passed"), ` ${when(one.when_utc)}`, validity(one) && h("span", { class: "soft small" }, `, ${validity(one)}`)),
         residual(one),
-        h("dl", { class: "values small" }, ...Object.entries(one.values).slice(0, 4).flatMap(([key, value]) => [h("dt", {}, key.replaceAll("_", " ")), h("dd", {}, value)])),
+        h("dl", { class: "values small" }, ...Object.entries(one.quantities).slice(0, 4).flatMap(([key, of]) => [h("dt", {}, key.replaceAll("_", " ")), h("dd", {}, of.text)])),
+        Object.keys(one.quantities).length ? traceability(one) : null,
         ...one.rejections.map((words) => h("p", { class: "error small" }, words))));
       return h("li", { class: "card" }, h("h2", {}, title), ...(results.length ? results : [h("p", { class: "soft" }, "Never done on this bench.")]), h("button", { class: results.length ? "quiet" : "", onclick: () => submit({ kind: "calibrate", name }) }, results.length ? "Run again" : "Run"));
     });
     $("calibrations").replaceChildren(...(cards.length ? cards : [h("li", { class: "empty" }, "No calibrations are installed.")]));
-    table($("history"), ["Calibration", "Date", "Outcome", "Values"], history.map((one) => [one.name, when(one.when_utc), one.passed ? "passed" : "not passed", Object.entries(one.values).map(([key, value]) => `${key} ${value}`).join("; ")]));
+    table($("history"), ["Calibration", "Date", "Outcome", "Values"], history.map((one) => [one.name, when(one.when_utc), one.passed ? "passed" : "not passed", Object.entries(one.quantities).map(([key, of]) => `${key} ${of.text}`).join("; ")]));
   };
   on("hello", () => act(load));
   followJob(["calibrate"], { render(job) { showJob($("job"), job); if (job.state === "done") act(load); } });

@@ -3,13 +3,14 @@
 import asyncio
 import json
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from inspect import signature
 from typing import Any, get_args
 
 import pytest
 
 from rig.bench import Bench, open_bench
+from rig.calibrations import CalibrationStore
 from rig.catalog import Catalog
 from rig.config import load_config
 from rig.core.clock import SystemClock
@@ -21,6 +22,7 @@ from rig.safety.stop_channel import StopAnswer, StopRequest
 from rig.web.requests import GotoRequest, JobRequest
 from rig.web.setup import Listening, Setup
 from rig.web.work import JOBS
+from tests.rig.calibrations.test_calibrations import RESULT
 from tests.rig.web.conftest import Served, connected
 
 
@@ -211,6 +213,26 @@ def test_calibrations_are_offered_and_others_rejected(serve):
     assert set(offered) == {"servo", "imu", "shaper", "mark", "camera", "camera-time", "table", "noise"}
     assert served.run(kind="calibrate", name="nothing")["error"]["code"] == 200
     assert served.run(kind="calibrate", name="noise")["error"]["code"] == 200
+
+
+def test_calibration_has_its_uncertainty_budget_reference_and_validity(serve, tmp_path):
+    served = serve()
+    CalibrationStore(tmp_path / "cal" / "sim").add(replace(RESULT, valid_days=30.0))
+    (row,) = served.client.get("/api/v1/calibrations").json()["history"]
+    assert (row["reference"], row["operator"]) == ("encoder of the servo", "A. Silva")
+    assert row["valid_until"] == "2026-03-31T12:00:00Z"
+    assert row["software"].startswith("hbr-rig ")
+    scale = row["quantities"]["scale"]
+    assert (scale["value"], scale["uncertainty"], scale["k"], scale["expanded"]) == (1.01, 1e-4, 2, 2e-4)
+    (source,) = scale["budget"]
+    assert source == {
+        "source": "scatter",
+        "kind": "A",
+        "uncertainty": 1e-4,
+        "unit": "1",
+        "sensitivity": 1.0,
+        "contribution": 1e-4,
+    }
 
 
 @pytest.mark.nightly
