@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 LIBRARY := hbr/kernels/_kernels.so
 
 .NOTPARALLEL:
-.PHONY: FORCE demo web test test-nightly test-kills test-web kernel-test fuzz lint docs hardware wheel bench lock clean test-servers help
+.PHONY: FORCE demo web test test-nightly test-kills test-web kernel-test fuzz lint docs hardware wheel bench lock clean test-servers debian-test help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
@@ -20,6 +20,7 @@ help:
 	@echo "make test-kills  kill the program at a hundred points of its work, and check the stored data"
 	@echo "make test-web   test the pages in a real browser, and attack the server"
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
+	@echo "make debian-test  install the program as on a Raspberry Pi, on a Debian in a container (root, 10 minutes)"
 	@echo "make test-servers  test PostgreSQL, S3 and bluesky with real servers"
 	@echo "make fuzz   attack every kind of input, 5 to 45 minutes (a part of test-nightly)"
 	@echo "make lint   check formatting, lint, types, import contracts and licenses"
@@ -39,10 +40,10 @@ web: $(READY) $(LIBRARY)
 test: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs
 
-# This also selects the tests marked nightly. It leaves out the kernel tests, which need the whole computer. With so many
+# This also selects the tests marked nightly. It leaves out the kernel tests and the installation on a Debian, which need the whole computer. With so many
 # cases, one test may take minutes, so the limit that ends a test that hangs is longer.
 test-nightly: $(READY) $(LIBRARY)
-	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel" --timeout 1800 --hypothesis-profile=nightly
+	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel and not debian" --timeout 1800 --hypothesis-profile=nightly
 
 # Kill the program a hundred times at different points of the commands and of the work on a catalog, or a thousand times with KILLS=90.
 KILLS ?= 8
@@ -63,6 +64,10 @@ kernel-test: $(READY) $(LIBRARY)
 	    "   apt-get download \$$(apt-cache depends linux-image-amd64 | sed -n 's/.*Depends: \(linux-image.*\)/\1/p')\n" \
 	    "The virtual machine needs: sudo apt-get install --no-install-recommends qemu-system-x86 busybox-static kmod udev"
 	@$(BIN)/python -m pytest -rs -m kernel -o faulthandler_timeout=300 tests/kernel
+
+# This needs root and Debian's debootstrap and systemd-container. It makes a Debian in RIG_TEST_DEBIAN, once.
+debian-test: wheel
+	@$(BIN)/python -m pytest -rs -m debian tests/deploy
 
 # This needs Debian's postgresql. The packages of these tests are large, so only this target installs them.
 test-servers: $(READY) $(LIBRARY)

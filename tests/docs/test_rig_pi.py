@@ -15,7 +15,7 @@ from tests.docs.pages import DOCS
 SCRIPT = DOCS / "deploy" / "rig-pi"
 STUBS = {
     **dict.fromkeys(("apt-get", "id", "useradd", "getent", "usermod", "hostnamectl", "udevadm", "sleep"), "exit 0"),
-    "runuser": 'mkdir -p "$ROOT/var/lib/rig/state" && touch "$ROOT/var/lib/rig/state/tokens.json" && echo rig_secret',
+    "runuser": 'case "$*" in *touch*) exit 0 ;; esac; mkdir -p "$ROOT/var/lib/rig/state" && touch "$ROOT/var/lib/rig/state/tokens.json" && echo rig_secret',
     "systemctl": 'echo "$@" >>"$ROOT/systemctl"',
     # A version whose name has "broken" in it never answers.
     "curl": 'case $(readlink "$ROOT/opt/rig") in *broken*) exit 7 ;; esac',
@@ -30,7 +30,7 @@ chmod +x "$3"/bin/*""",
 def install(tmp_path: Path) -> Any:
     """Return a function that installs a wheel of this name below a folder, with stubs for what changes the system."""
     root, stubs = tmp_path / "root", tmp_path / "stubs"
-    root.mkdir()
+    (root / "var/lib/rig").mkdir(parents=True)
     stubs.mkdir()
     for name, text in STUBS.items():
         (stubs / name).write_text(f"#!/bin/sh\n{text}\n")
