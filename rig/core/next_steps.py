@@ -114,7 +114,7 @@ class NextStep:
     """What to do."""
     parameters: dict[str, Any] = field(default_factory=dict)
     """Its parameters. Passwords in them are masked."""
-    # Made from the action also when a step is read: a stored command is not believed.
+    # Made from the action also when a step is read: a stored command is not used.
     command: str | None = field(default=None, compare=False)
     """The command line; an unknown parameter is in capitals. Null if no command does the action."""
 

@@ -335,8 +335,8 @@ class Quantity(BaseModel):
 class CalibrationRow(BaseModel):
     """A calibration that was run, with its worst ``residual`` and the ``limit`` for it.
 
-    ``id`` is the name by which a stored view refers to it. It was compared with the ``reference``. If ``valid_until`` is
-    null, it is valid until a device changes.
+    ``id`` is the name by which a stored view refers to it. It was compared with the ``reference``. If ``valid_until``
+    is null, it is valid until a device changes.
     """
 
     id: str

@@ -88,7 +88,7 @@ class ServedDesk(Desk):
         """Close the bench, for a job that opens its devices itself."""
         self._worker.close()
 
-    def open_anew(self, config: RigConfig) -> None:
+    def open_with(self, config: RigConfig) -> None:
         """Open the bench again, with this configuration from now on."""
         self._worker.open(config)
 
@@ -246,7 +246,7 @@ def _lock_camera(desk: ServedDesk, **settings: float | None) -> Steps[None]:
     """Open the bench with other settings of its camera; if it does not take them, the next job has those before."""
     given = {key: value for key, value in settings.items() if value is not None}
     camera = desk.config.camera.model_copy(update=given)
-    desk.open_anew(desk.config.model_copy(update={"camera": camera}))
+    desk.open_with(desk.config.model_copy(update={"camera": camera}))
     yield JobResult(requests.CameraSettings(**settings), "The camera is locked with these settings.")
 
 

@@ -301,7 +301,7 @@ class BenchWorker:
         return self.open(self.config) if self._bench is None else self._bench
 
     def open(self, config: RigConfig) -> Bench:
-        """Open the bench anew with a configuration; if that succeeds, it is opened with this one from now on."""
+        """Open the bench again with a configuration; if that succeeds, it is opened with this one from now on."""
         self.close()
         self._tried_ns = self._clock.now_ns()
         try:

@@ -400,7 +400,7 @@ def test_bad_view_is_taken_again_unless_the_object_stands_otherwise(page, serve_
     place = page.text_content("#viewer .number")
     page.click("#retake")
     page.click("dialog button:has-text('Take it again')")
-    page.wait_for_selector(".toast:has-text('was taken again')", timeout=WAIT_MS)
+    page.wait_for_selector(".toast:has-text('was taken again')")
     page.wait_for_selector("#enrollments li:has-text('replaced')")
     assert page.text_content("#viewer .number") == place
     after = call(server, "objects/teapot")["views_taken"]
@@ -413,5 +413,5 @@ def test_bad_view_is_taken_again_unless_the_object_stands_otherwise(page, serve_
     page.goto(f"{server.url}object?name=teapot")
     page.click("#retake")
     page.click("dialog button:has-text('Take it again')")
-    page.wait_for_selector("#job .failure:has-text('does not stand as it stood')", timeout=WAIT_MS)
+    page.wait_for_selector("#job .failure:has-text('does not stand as it stood')")
     assert call(server, "objects/teapot")["views_taken"] == after

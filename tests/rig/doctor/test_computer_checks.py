@@ -169,7 +169,7 @@ def test_latched_fault_and_damaged_state_are_reported(bench):
     store.save(State(fault=LatchedFault.of(DeviceSilent("Servo 1 is gone.", next_step="Look."), utc)))
     problem = bench.problem("bench")
     assert (problem.code, problem.parameters["code"]) == (FindingCode.FAULT_LATCHED, 402)
-    assert problem.parameters["what"] == "Servo 1 is gone."
+    assert problem.parameters["detail"] == "Servo 1 is gone."
     assert problem.steps == (Do.ACKNOWLEDGE(),)
     store.latch(None)
     (store.path / "state.json").write_text("{")

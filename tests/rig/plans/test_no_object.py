@@ -148,7 +148,7 @@ def test_watch_reports_an_empty_table_and_waits_for_the_next_object(bench, model
         if isinstance(event, Waiting) and answers:
             world.put(shelf()["lamp"])
         if isinstance(event, Failed | Identified):
-            answers.append(event.code if isinstance(event, Failed) else event.name)
+            answers.append(event.error.code if isinstance(event, Failed) else event.name)
             if len(answers) == 2:
                 break
     assert answers == [606, "lamp"]
