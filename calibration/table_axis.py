@@ -347,14 +347,14 @@ class _Axis:
         beside = point + up * float((middle - point) @ up)
         return np.concatenate([beside, up, self._seen(beside[None], p)[0], [degrees(hypot(*lean))]])
 
-    def _residuals(self, p: Floats, rotated: float = 0.0) -> Floats:
-        """Return the residuals of corners and known values, with the table ``rotated`` further (rad) in each view."""
+    def _residuals(self, p: Floats, further: float = 0.0) -> Floats:
+        """Return the residuals of corners and known values, with the table rotated ``further`` (rad) in each view."""
         up, point, lean = self._geometry(p)
         parts = []
         for view, board_points in zip(self._views, self._points, strict=True):
             begin = FIRST_POSE + 6 * self._stands.index(view.stand)
             at_zero = board_points @ cv2.Rodrigues(p[begin : begin + 3])[0].T + p[begin + 3 : begin + 6]
-            angle = radians(view.table_deg) + rotated
+            angle = radians(view.table_deg) + further
             c, s = np.cos(2 * angle), np.sin(2 * angle)
             leaning = (c * lean[0] - s * lean[1]) * self._across[0] + (s * lean[0] + c * lean[1]) * self._across[1]
             rotation = cv2.Rodrigues(leaning)[0] @ cv2.Rodrigues(up * angle)[0]

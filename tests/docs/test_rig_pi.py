@@ -15,8 +15,8 @@ from tests.docs.pages import DOCS
 SCRIPT = DOCS / "deploy" / "rig-pi"
 STUBS = {
     **dict.fromkeys(("apt-get", "id", "useradd", "getent", "usermod", "hostnamectl", "udevadm", "sleep"), "exit 0"),
-    "runuser": 'case "$*" in *touch*) exit 0 ;; esac; state=$ROOT/var/lib/rig/state; '
-    'mkdir -p "$state" && touch "$state/tokens.json" && echo rig_secret',
+    "runuser": """case "$*" in *touch*) exit 0 ;; esac
+mkdir -p "$ROOT/var/lib/rig/state" && touch "$ROOT/var/lib/rig/state/tokens.json" && echo rig_secret""",
     "systemctl": 'echo "$@" >>"$ROOT/systemctl"',
     # A version whose name has "broken" in it never answers.
     "curl": 'case $(readlink "$ROOT/opt/rig") in *broken*) exit 7 ;; esac',
