@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 
 from rig.catalog import Catalog
 from rig.catalog.journal import comparable_views, journal_words
@@ -46,6 +47,16 @@ def enroll(
         yield from _delivered(desk, catalog, events)
 
 
+@dataclass(frozen=True, slots=True)
+class ViewsTakenAgain:
+    """The views of an enrolled object that were taken again."""
+
+    name: str
+    """Name of the object."""
+    taken_again: tuple[int, ...]
+    """Indices of the views."""
+
+
 def retake(desk: Desk, name: str, views: Sequence[int]) -> Steps[None]:
     """Take ``views`` of an enrolled object again, by their indices, as `rig.plans.enroll.retake`.
 
@@ -56,7 +67,7 @@ def retake(desk: Desk, name: str, views: Sequence[int]) -> Steps[None]:
         done = yield from retake_views(bench, catalog, name, views)
     numbers = [str(index + 1) for index in done.indices]
     text = f"{'View' if len(numbers) == 1 else 'Views'} {joined(numbers)} of {done.object_name} "
-    values = {"name": done.object_name, "taken_again": list(done.indices)}
+    values = ViewsTakenAgain(done.object_name, done.indices)
     yield JobResult(values, f"{text}{'was' if len(numbers) == 1 else 'were'} taken again.")
 
 

@@ -61,15 +61,10 @@ class SavedTable(_Saved):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LatchedFault(Problem):
-    """A latched fault, which must be acknowledged before the table moves again: an error, and its time.
-
-    Attributes
-    ----------
-    utc
-        When it was latched.
-    """
+    """A latched fault, which must be acknowledged before the table moves again: an error, and its time."""
 
     utc: str
+    """When it was latched."""
 
     @classmethod
     def of(cls, error: RigError, utc: str) -> "LatchedFault":

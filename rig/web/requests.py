@@ -9,6 +9,7 @@ from rig.core.errors import Problem
 from rig.core.next_steps import NextSteps
 from rig.events.events import Enrolled, Identified
 from rig.jobs.doctor import Examined
+from rig.jobs.enroll import ViewsTakenAgain
 from rig.jobs.table import Acknowledged, TableAngle
 from rig.plans.operator import Choice
 from rig.web.access import MAX_NAME, Role
@@ -192,7 +193,9 @@ class Calibrated(_Request):
     calibrations: list[CalibrationRun]
 
 
-JobOutcome = Enrolled | Identified | TableAngle | Acknowledged | Examined | CameraSettings | Calibrated
+JobOutcome = (
+    Enrolled | ViewsTakenAgain | Identified | TableAngle | Acknowledged | Examined | CameraSettings | Calibrated
+)
 
 
 class JobState(StrEnum):

@@ -201,7 +201,7 @@ def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_p
             if name == "radio":  # the light goes out after the object was detected
                 at(s, 6.2, lambda: s.world.change(light=(0.0, 0.0, 0.0)))
         if isinstance(event, Failed | Identified):
-            answers.append(event.code if isinstance(event, Failed) else event.name)
+            answers.append(event.error.code if isinstance(event, Failed) else event.name)
             if not upcoming:
                 break
     assert answers == ["toy-car", 600, "book-night"]

@@ -71,7 +71,7 @@ def test_estop_during_a_motion_stops_the_table_and_latches(on_head):
         s.world.clock.call_at(s.world.clock.now_ns() + 1_500_000_000, lambda: setattr(head, "estop_open", True))
         table.goto(300.0)
     assert s.bench.safety.state is TableState.FAULT
-    assert "e-stop" in s.bench.safety.fault.what
+    assert "e-stop" in s.bench.safety.fault.detail
     stopped_deg = s.world.table_deg()
     assert 1.0 < stopped_deg < 299.0
     assert not head.relay_closed
