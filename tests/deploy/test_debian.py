@@ -30,7 +30,6 @@ ENVIRONMENT = (
     "HOME=/root",
     "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
     "LIMIT=600",
-    "PIP_NO_COMPILE=1",
 )
 
 
@@ -38,12 +37,16 @@ class Debian:
     """A running container; ``sh`` runs a command in it as root."""
 
     def __init__(self, leader: int) -> None:
-        self._enter = ["nsenter", "--target", str(leader), "--all", "--wd=/root", "env", "-i"]
+        self._enter = ["nsenter", "--target", str(leader), "--all", "--wd=/", "env", "-i"]
         self._enter += ENVIRONMENT
 
     def sh(self, command: str, check: bool = True, given: bytes = b"") -> subprocess.CompletedProcess[str]:
         done = subprocess.run(
-            [*self._enter, "sh", "-c", command], input=given, capture_output=True, check=False, timeout=ANSWER_S
+            [*self._enter, "sh", "-c", f"cd /root && {command}"],
+            input=given,
+            capture_output=True,
+            check=False,
+            timeout=ANSWER_S,
         )
         answer = subprocess.CompletedProcess(command, done.returncode, done.stdout.decode(), done.stderr.decode())
         assert answer.returncode == 0 or not check, (command, answer.stdout[-2000:], answer.stderr[-2000:])
@@ -89,11 +92,8 @@ def debian(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Debian]:
         with suppress(FileNotFoundError):
             shutil.copy(Path("/etc") / name, BASE / "etc" / name)
     log = (tmp_path_factory.mktemp("debian") / "console").open("wb")
-    packages = BASE.with_name("packages")  # what pip has downloaded before
-    packages.mkdir(exist_ok=True)
     command = [
         "systemd-nspawn",
-        f"--bind={packages}:/root/.cache/pip",
         "--quiet",
         "--register=no",
         "--keep-unit",

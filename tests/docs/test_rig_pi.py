@@ -32,6 +32,8 @@ def install(tmp_path: Path) -> Any:
     """Return a function that installs a wheel of this name below a folder, with stubs for what changes the system."""
     root, stubs = tmp_path / "root", tmp_path / "stubs"
     (root / "var/lib/rig").mkdir(parents=True)
+    (root / "etc").mkdir()
+    (root / "etc/hosts").write_text("127.0.0.1 localhost\n")
     stubs.mkdir()
     for name, text in STUBS.items():
         (stubs / name).write_text(f"#!/bin/sh\n{text}\n")
