@@ -37,12 +37,12 @@ class Debian:
     """A running container; ``sh`` runs a command in it as root."""
 
     def __init__(self, leader: int) -> None:
-        self._enter = ["nsenter", "--target", str(leader), "--all", "--wd=/", "env", "-i"]
+        self._enter = ["nsenter", "--target", str(leader), "--all", "env", "-i", "--chdir=/root"]
         self._enter += ENVIRONMENT
 
     def sh(self, command: str, check: bool = True, given: bytes = b"") -> subprocess.CompletedProcess[str]:
         done = subprocess.run(
-            [*self._enter, "sh", "-c", f"cd /root && {command}"],
+            [*self._enter, "sh", "-c", command],
             input=given,
             capture_output=True,
             check=False,
