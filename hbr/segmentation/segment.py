@@ -41,7 +41,7 @@ _SURE: Final = 0.85
 _SURE_OF: Final = 0.02
 #: A pixel that is brighter than the empty table by more than this, in logarithms, belongs to the object,
 _BRIGHTER: Final = 0.3
-#: if it is more probable than this: else the holder of the lamp belongs to it, too.
+#: if it is more probable than this: a bright bar in front of the object is not part of it.
 # 1 of 150 drawn silhouettes after hard changes becomes worse; without this limit 23 do
 _TRACE: Final = 0.03
 #: A part is the platter, or the object of other views, if the mean of its pixels is more than this.

@@ -52,7 +52,7 @@ class Retake:
         """Begin to take the views with these indices again. The other values are as for `Catalog.begin`.
 
         Raises `ObjectNotFound`: there is no object of that name. `CatalogError`: it has no complete enrollment, or was
-        not enrolled by a bench. `UsageError`: it has no such views, or no other ones.
+        not enrolled by a bench at rest. `UsageError`: it has no such views, or no other ones.
         """
         found = catalog.object(name)
         former, name = found.complete, found.summary.name
@@ -61,6 +61,10 @@ class Retake:
         if any(view.commanded_deg is None for view in former.views):
             raise CatalogError(
                 f"The views of {name!r} were not taken by a bench.", next_step=Do.ENROLL_AGAIN(name=name)
+            )
+        if any(view.evidence.get("motion") for view in former.views):  # the table does not stand where they were taken
+            raise CatalogError(
+                f"The views of {name!r} were taken in motion.", next_step=Do.ENROLL_AGAIN(name=name, fly=True)
             )
         count, wanted = len(former.views), tuple(sorted(set(indices)))
         if not wanted or not 0 <= wanted[0] <= wanted[-1] < count:

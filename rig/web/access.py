@@ -106,8 +106,9 @@ class Tokens:
         expires = None if days is None else now + timedelta(days=days)
         stored = StoredToken(name=name, role=role, sha256=_hash(token), created_utc=now, expires_utc=expires)
         with self._changing:
-            others = [other for other in self.stored() if other.name != name]
-            if not replace and len(others) < len(self._known):
+            known = self.stored()
+            others = [other for other in known if other.name != name]
+            if not replace and len(others) < len(known):
                 raise UsageError(
                     f"There is a token {name} already.", next_step="Choose another name, or revoke that token first."
                 )

@@ -22,7 +22,8 @@ async function showView(view) {
     ["Too bright", e.saturated_share === undefined ? null : `${(100 * e.saturated_share).toFixed(1)} %`],
     ["Exposure", e.locks?.exposure_us && `${(e.locks.exposure_us / 1000).toFixed(1)} ms`],
   ]);
-  $("retake").disabled = !canOperate() || !view.captured_utc; // of an import, no bench knows where it stood
+  // of an import, no bench knows where it stood; of views in motion, the table stands at none of their angles
+  $("retake").disabled = !canOperate() || !view.captured_utc || Boolean(view.evidence.motion);
   if (!$("outline-on").checked) return;
   const place = one.views_taken.indexOf(view);
   silhouettes[place] ||= get(`/silhouette?object=${at(one.name)}&index=${place}`).catch(() => null);

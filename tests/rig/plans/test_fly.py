@@ -12,7 +12,15 @@ import pytest
 from rig import Catalog, enroll
 from rig.bench import Bench
 from rig.config import load_config
-from rig.core.errors import DeviceSilent, LimitExceeded, ObjectMoved, RigError, RotationDisagreement, UsageError
+from rig.core.errors import (
+    CatalogError,
+    DeviceSilent,
+    LimitExceeded,
+    ObjectMoved,
+    RigError,
+    RotationDisagreement,
+    UsageError,
+)
 from rig.core.next_steps import Do
 from rig.devices.camera import Frame
 from rig.events.events import Accepted, Enrolled, Event, ScanStarted
@@ -21,6 +29,7 @@ from rig.motion.flight_views import FlightFrames, irregular_stamps
 from rig.motion.move import MotionTimes
 from rig.motion.scan_speed import SpeedLimit
 from rig.motion.turntable import Turntable
+from rig.plans.enroll import retake
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.saved_state import StateStore
 from rig.views.capture import RejectReason
@@ -99,6 +108,8 @@ def test_one_revolution_enrolls_all_views_at_their_true_angles(tmp_path: Path) -
         assert "allows" in line(started)
         assert abs(bench.servo.read_state().velocity_dps) < 1
         assert not bench.servo.read_condition().torque
+        with pytest.raises(CatalogError, match="taken in motion"):
+            next(retake(bench, catalog, "block", [3]))
 
 
 def test_rolling_shutter_exposes_the_rows_of_the_object_later() -> None:
