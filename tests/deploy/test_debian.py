@@ -131,6 +131,9 @@ def test_bench_is_installed_updated_and_returned(debian, tmp_path):
     debian.put(f"/boot/firmware/{wheel.name}", wheel.read_bytes())
     unit = (DOCS / "deploy" / "rig-pi.conf").read_bytes().replace(b"--bench hardware", b"--bench sim")
     debian.put("/etc/systemd/system/rig.service.d/z-simulated.conf", unit)
+    debian.sh("useradd --system --create-home --home-dir /var/lib/rig rig")
+    debian.put("/var/lib/rig/rig.toml", b'default_bench = "sim"\n')
+    debian.sh("chown rig: /var/lib/rig/rig.toml")
     install = f"cd /boot/firmware && sh deploy/rig-pi {wheel.name}"
 
     # The first installation.
