@@ -112,7 +112,7 @@ lock:
 	printf 'hatchling\neditables\n' | uv pip compile - pyproject.toml --constraint requirements.lock --universal --python-version 3.11 \
 	    --generate-hashes --no-header --no-emit-index-url -o .ci/core.lock
 	for tool in uv:uv 'setuptools poetry-core:backend' cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
-	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
+	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] bluesky bluesky-tiled-plugins tiled[client,server] pycolmap:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
 	echo build123d | uv pip compile - --constraint requirements.lock --universal --python-version 3.11 \

@@ -18,8 +18,10 @@ from rig.catalog.exchange.scan import ScanFormat, write_scan
 from rig.catalog.transfer import CatalogSource
 from rig.core.errors import ExportFailed
 from rig.views.charuco_board import CharucoBoard
+from sim.calibration_board import BoardOnPlatter, home_mark
 from sim.clock import VirtualClock
-from tests.calibration.board_bench import optics, seen
+from sim.objects.solid import empty_platter
+from tests.calibration.board_bench import noise, optics, seen
 from tests.rig.catalog.catalog_samples import without_waiting
 
 TABLE_DEG = (0.0, -100.0, 30.5, 215.0)
@@ -39,22 +41,30 @@ def results() -> tuple[CalibrationResult, CalibrationResult]:
     )
 
 
+def enroll(catalog: Catalog, name: str, pictures: dict[float, Any], calibrated: bool = True) -> None:
+    """Store pictures, by the angle of the table, as an enrollment with calibrations stores them."""
+    ids = [one.id for one in results()] if calibrated else []
+    provenance = Provenance(
+        *("sim", {"camera": {"name": "Acme Eye 3"}}, {"calibrations": ids}, "hbr-rig 0.1.0"),
+    )
+    views = sorted((-angle % 360, picture) for angle, picture in pictures.items())
+    enrollment = catalog.begin(name, planned_azimuth_deg=[azimuth for azimuth, _ in views], provenance=provenance)
+    for index, (azimuth_deg, picture) in enumerate(views):
+        enrollment.add(View(index=index, azimuth_deg=azimuth_deg), picture)
+    enrollment.finish()
+
+
 @pytest.fixture
 def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CatalogSource:
-    """Return an object with a view from each of `TABLE_DEG`, as an enrollment with calibrations stores it."""
+    """Return an object with a view from each of `TABLE_DEG`."""
     without_waiting(monkeypatch)
     catalog = Catalog.open(tmp_path / "catalog", clock=VirtualClock())
-    azimuths_deg = [-angle % 360 for angle in TABLE_DEG]
-    for name, ids in (("mug", [one.id for one in results()]), ("jug", [])):
-        provenance = Provenance(
-            *("sim", {"camera": {"name": "Acme Eye 3"}}, {"calibrations": ids}, "hbr-rig 0.1.0"),
-        )
-        enrollment = catalog.begin(name, planned_azimuth_deg=sorted(azimuths_deg), provenance=provenance)
-        for index, azimuth_deg in enumerate(sorted(azimuths_deg)):
-            frame = np.full((480, 640, 3), 128, np.uint8)
-            cv2.ellipse(frame, (320, 240 + index), (60, 90), 0, 0, 360, (40, 60, 200), -1)
-            enrollment.add(View(index=index, azimuth_deg=azimuth_deg), frame)
-        enrollment.finish()
+    frames = {}
+    for index, table_deg in enumerate(sorted(TABLE_DEG, key=lambda angle: -angle % 360)):
+        frame = frames[table_deg] = np.full((480, 640, 3), 128, np.uint8)
+        cv2.ellipse(frame, (320, 240 + index), (60, 90), 0, 0, 360, (40, 60, 200), -1)
+    enroll(catalog, "mug", frames)
+    enroll(catalog, "jug", frames, calibrated=False)
     return CatalogSource(catalog, ["mug"])
 
 
@@ -130,6 +140,43 @@ def test_colmap_reads_the_scan(source, tmp_path):
         assert pose.matrix() == pytest.approx(to_camera[:3], abs=1e-6)
     exif = pycolmap.Bitmap.read(str(tmp_path / "scan" / "images" / "000.png"), True)
     assert exif is not None
+
+
+def test_colmap_reconstructs_boards_within_a_pixel(source, tmp_path):
+    """Boards, because the simulator draws them through the lens, and all other objects in parallel projection."""
+    pycolmap = pytest.importorskip("pycolmap")
+    pictures = {}
+    for table_deg in np.arange(-40.0, 41.0, 20.0):
+        picture = empty_platter()
+        for board in (BoardOnPlatter(CharucoBoard(), TRUE, tilt_deg=4.0), home_mark(TRUE)):
+            board.draw(picture, table_deg)
+        pictures[table_deg] = np.clip(picture + noise(), 0, 255).astype(np.uint8)
+    enroll(source.catalog, "boards", pictures)
+    scan, database, points = (tmp_path / name for name in ("scan", "database", "points"))
+    write_scan(scan, CatalogSource(source.catalog, ["boards"]), ScanFormat.COLMAP, results())
+    read = pycolmap.Reconstruction(str(scan / "sparse" / "0"))
+    (camera,) = read.cameras.values()
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model, reader.camera_params = camera.model.name, camera.params_to_string()
+    reader.mask_path = str(scan / "masks")
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads = 1  # images get their numbers in their order
+    one_camera = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(
+        database, scan / "images", camera_mode=one_camera, reader_options=reader, extraction_options=extraction
+    )
+    pycolmap.match_exhaustive(database)
+    points.mkdir()
+    found = pycolmap.triangulate_points(read, database, scan / "images", points)
+    assert found.num_points3D() > 200
+    assert found.compute_mean_reprojection_error() < 0.5
+    # They are where the boards stand: the upright one leans by 4°, and the card of the home mark is in front of it.
+    y, z = np.array([point.xyz[1:] for point in found.points3D.values()]).T
+    on_board = np.abs(y - (z - 75.0) * np.tan(radians(4.0))) < 2.0
+    on_card = ~on_board & (y < -40.0)
+    assert np.mean(on_board | on_card) > 0.9
+    assert on_board.sum() > 100
+    assert on_card.sum() > 10
 
 
 def test_colmap_files_name_one_camera_and_each_image(source, tmp_path):
