@@ -1,5 +1,6 @@
 """The bench, put together from printed and bought parts."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import cos, radians, sin
 
@@ -37,12 +38,14 @@ def upright(x: float, y: float, z: float) -> Location:
     return Location(Plane((x, y, z), x_dir=(0, 1, 0), z_dir=(1, 0, 0)))
 
 
-def camera_pivot() -> tuple[float, float]:
-    """Return (y, z) of the camera head's pivot, with the lens where the simulator has it."""
-    tilt = radians(TABLE["camera"]["tilt_deg"])
+def camera_pivot(
+    lens: Sequence[float] = parts.LENS, tilt_deg: float = TABLE["camera"]["tilt_deg"]
+) -> tuple[float, float]:
+    """Return (y, z) of the camera head's pivot for a place of the lens; without one, for that of the simulator."""
+    tilt = radians(tilt_deg)
     forward, up = parts.LENS_FORWARD, parts.LENS_UP
-    y = parts.LENS[1] - forward * cos(tilt) - up * sin(tilt)
-    return float(y), float(parts.LENS[2] - up * cos(tilt) + forward * sin(tilt))
+    y = lens[1] - forward * cos(tilt) - up * sin(tilt)
+    return float(y), float(lens[2] - up * cos(tilt) + forward * sin(tilt))
 
 
 def table(servo: str = "xl430_w250") -> list[Item]:

@@ -2,7 +2,7 @@
 
 from functools import cache
 from itertools import product
-from math import hypot, isclose, pi, radians, sin
+from math import cos, hypot, isclose, pi, radians, sin
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from sim.servo.models import servo_model
 from tests.docs.pages import DOCS
 
 PRINT = TABLE["print"]
+CLAMP_HALF = 23.0  # of the camera head on the post
 EVERY_PART = pytest.mark.parametrize(
     "name", [*parts.PRINTED, *(f"{fitted}-{servo}" for fitted in parts.FITTED for servo in SERVOS)]
 )
@@ -258,7 +259,7 @@ def test_camera_stands_where_the_simulator_has_it():
     assert np.array([lens.X, lens.Y, lens.Z]) == pytest.approx(
         rotation.T @ -np.array(Optics().translation_mm) + (0, 0, TOP_Z)
     )
-    assert z + 23 <= TABLE["profile"]["side"] + TABLE["profile"]["post"]
+    assert z + CLAMP_HALF <= PROFILE["side"] + PROFILE["post"]
 
 
 def test_home_card_stands_where_the_simulator_has_it():
@@ -282,6 +283,14 @@ def test_guide_has_the_numbers_of_the_parts():
     near, far = RAIL_Y
     y, z = camera_pivot()
     front = y - parts.PIVOT_OUT
+    # The other tilt: nearer, so that the post is long enough, with the platter's middle at the same place of the image.
+    tilt, nearer = radians(20), 450 / TABLE["camera"]["distance"]
+    _, down, away = nearer * np.array(Optics().translation_mm)
+    steep = (0.0, down * sin(tilt) - away * cos(tilt), down * cos(tilt) + away * sin(tilt) + TOP_Z)
+    its_y, its_z = camera_pivot(steep, 20)
+    its_front = its_y - parts.PIVOT_OUT
+    assert 20 in TABLE["camera"]["marks_deg"]
+    assert its_z + CLAMP_HALF <= PROFILE["side"] + PROFILE["post"]
     own = SERVOS["xl430_w250"]
     under = parts.HORN_Z - own["horn_height"]
     board = CharucoBoard()
@@ -291,6 +300,9 @@ def test_guide_has_the_numbers_of_the_parts():
         f"{-front:.0f} mm before the axis ({front - near:.0f} mm from the end of the rail)",
         f"{z:.0f} mm above the desk at the pivot",
         f"the lens is {parts.LENS[2]:.0f} mm above the desk and {-parts.LENS[1]:.0f} mm before the axis",
+        f"The post's front {-its_front:.0f} mm before the axis ({its_front - near:.0f} mm from the end of the rail)",
+        f"the pivot {its_z:.0f} mm above the desk",
+        f"the lens {steep[2]:.0f} mm above it and {-steep[1]:.0f} mm before the axis",
         f"the plate hangs {parts.DECK_Z - under - parts.PLATE:.0f} mm below the deck",
         f"Below the servo, {under - own['body'][2] - parts.BASE_Z - parts.FLOOR:.0f} mm are free",
         f"plates {card['columns'] * 15 + 10} × {card['rows'] * 15 + 10} and "
