@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import ImageArray
+from hbr.core.arrays import FloatArray, ImageArray
 
 Mask = NDArray[np.uint8]
 Map = NDArray[np.float32]
@@ -36,6 +36,8 @@ _AREAS: Final = (0.55, 1.8)  # outside, the two boxes cannot be of one object, o
 #: Units of a logarithm, and grey levels that keep it finite.
 _UNITS: Final = 40.0
 _DARK: Final = (9.0, 12.0)  # larger: less noise of dark pixels, and less of their contrast
+#: Largest difference of the light that counts: a factor of e.
+_MOST_LIGHT: Final = 1.0
 #: Smallest number of common pixels for a comparison.
 _FEWEST: Final = 60
 
@@ -81,8 +83,17 @@ class Pixels:
         return cls(colours.astype(np.float32), np.asarray(mask, np.uint8), np.asarray(half, np.float32))
 
 
+class Compared(NamedTuple):
+    """What a registered enrolled view says of a view; zeros if the two have no common pixels."""
+
+    fit: float
+    """Share of the contrast that the enrolled view explains, at most 1."""
+    light: FloatArray
+    """float64 array (3,): median differences of the three logarithms, that is, of the exposure and the light."""
+
+
 class PixelFit(NamedTuple):
-    """The fit of the leading candidates of a search to its views, at most 1."""
+    """The comparison of the leading candidates of a search with its views; a fit is at most 1."""
 
     object_index: int
     """The leader, after the comparison, as an index of the views' names."""
@@ -93,27 +104,37 @@ class PixelFit(NamedTuple):
     """The best mean fit of the next candidates that are no near twins of the leader; 0 without one."""
     expected: float
     """Mean fit of the two enrolled views of the leader beside each view to each other."""
+    light: float
+    """How far the light of the views is from that of the leader's enrollment: the square of their mean
+    `Compared.light`, from 0 on."""
+
+    def numbers(self) -> list[float]:
+        """Return the numbers for the evidence (`hbr.dense.stopping`)."""
+        return [self.own, self.own - self.others, self.own - self.expected, min(self.light, _MOST_LIGHT)]
 
 
-def fit(view: Pixels, enrolled: Pixels) -> float:
-    """Return the share of contrast that an enrolled view explains, at most 1; 0 if the two have no common pixels."""
+def compare(view: Pixels, enrolled: Pixels) -> Compared:
+    """Register an enrolled view to a view, and compare the two."""
     begin = _begin(view, enrolled)
     found = _fit_map(view, enrolled, begin)
-    return max(_explained(view, enrolled, move) for move in ([begin] if found is None else [begin, found]))
+    moved = [_compare(view, enrolled, move) for move in ([begin] if found is None else [begin, found])]
+    return max(moved, key=lambda one: one.fit)
 
 
-def _explained(view: Pixels, enrolled: Pixels, move: Map) -> float:
-    """Return the share of contrast that an enrolled view explains when it is moved."""
+def _compare(view: Pixels, enrolled: Pixels, move: Map) -> Compared:
+    """Compare a view with an enrolled view that is moved."""
     size, flags = (SIDE_PX, SIDE_PX), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     moved = cv2.warpAffine(enrolled.colours, move, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     inside = (cv2.warpAffine(enrolled.mask, move, size, flags=flags) > 127).astype(np.uint8)
     common = cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0
     if int(common.sum()) < _FEWEST:
-        return 0.0
+        return Compared(0.0, np.zeros(3))
     a, b = view.colours[common], moved[common]
     apart = a - b
+    light = np.median(apart, axis=0)
     contrast = float(np.abs(a - np.median(a, axis=0)).sum() + np.abs(b - np.median(b, axis=0)).sum())
-    return 1 - float(np.abs(apart - np.median(apart, axis=0)).sum()) / max(contrast, 1e-6)
+    fit = 1 - float(np.abs(apart - light).sum()) / max(contrast, 1e-6)
+    return Compared(fit, light.astype(np.float64) / _UNITS)
 
 
 def _fit_map(view: Pixels, enrolled: Pixels, begin: Map) -> Map | None:

@@ -188,7 +188,7 @@ class _Model(NamedTuple):
     def log_odds(self, found: Sequence[float], fit: PixelFit | None) -> float:
         if fit is None:
             return self.alone(found)
-        return self.with_fit([*found, fit.own, fit.own - fit.others, fit.own - fit.expected])
+        return self.with_fit([*found, *fit.numbers()])
 
 
 @cache

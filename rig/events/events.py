@@ -299,7 +299,7 @@ class ObjectChanged:
 class Verified:
     """The enrolled views of the leading candidates were compared with the views so far, pixel by pixel.
 
-    A replay does not repeat this comparison: it uses the saved ``fit``, ``second``, ``others`` and ``expected``.
+    A replay does not repeat this comparison: it uses the saved values.
     """
 
     event: Literal["verified"] = field(default="verified", init=False)
@@ -315,6 +315,8 @@ class Verified:
     """The best of these shares for the next candidates that are no near twins of this one, at most 1; 0 without one."""
     expected: float
     """Share of the contrast that two neighbouring enrolled views of this candidate explain of each other, at most 1."""
+    light: float
+    """How far the light is from that of the enrollment, from 0 on (`hbr.dense.pixel_fit.PixelFit.light`)."""
     outcome: Outcome
     """Decision after the comparison: ``continue``, ``found``, ``ambiguous`` or ``unknown``."""
     probability: float

@@ -97,7 +97,7 @@ def check(run: SavedRun) -> ReplayCheck:
             case Verified():
                 # the enrolled images are not in the run, so their measured fit is used
                 leader = search.names.index(event.name)
-                measured = PixelFit(leader, event.fit, event.second, event.others, event.expected)
+                measured = PixelFit(leader, event.fit, event.second, event.others, event.expected, event.light)
                 computed = answered(search.verify((), measured))
             case Identified():
                 found.decisions += 1

@@ -421,6 +421,7 @@ class DenseSearch(Search):
             second=found.second,
             others=found.others,
             expected=found.expected,
+            light=found.light,
             outcome=decision.outcome,
             probability=decision.probability,
             not_enrolled=decision.not_enrolled,

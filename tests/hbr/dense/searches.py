@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from hbr import Belief, DenseIndex, Views, descriptor, update_belief
+from hbr.dense.pixel_fit import PixelFit
 from hbr.dense.space import parts_of
 
 LIGHT = "edges+colours+cedd"
+
+
+def fitted(
+    object_index: int, own: float, *, second: float = 0.3, others: float = 0.3, expected: float = 0.85
+) -> PixelFit:
+    """Return a fit in the light of the enrollment."""
+    return PixelFit(object_index, own, second, others, expected, 0.0)
 
 
 def catalog(objects: int = 8, *, seed: int = 0, kind: str = LIGHT, step_deg: float = 20.0) -> Views:

@@ -6,10 +6,9 @@ import pytest
 import hbr
 from hbr import Outcome
 from hbr.dense.arc import ArcSession
-from hbr.dense.pixel_fit import PixelFit
 from hbr.dense.session import NeedEnrolledViews, answered
 from hbr.dense.stopping import decide
-from tests.hbr.dense.searches import catalog, found_from
+from tests.hbr.dense.searches import catalog, fitted, found_from
 
 
 @pytest.fixture
@@ -28,7 +27,7 @@ def session() -> hbr.DenseSession:
 @pytest.mark.parametrize(("by", "outcome"), [(0.0, Outcome.AMBIGUOUS), (0.02, Outcome.AMBIGUOUS), (0.3, Outcome.FOUND)])
 def test_near_twins_are_ambiguous_unless_the_pixels_separate_them(session, by: float, outcome: Outcome) -> None:
     for twin in (0, 4):
-        answered(session.verify(lambda _: [], PixelFit(twin, 0.9, 0.9 - by, 0.2, 0.9)))
+        answered(session.verify(lambda _: [], fitted(twin, 0.9, second=0.9 - by, others=0.2, expected=0.9)))
         assert (session.end().outcome, session.end().object_index) == (outcome, twin if by else 0)
 
 
@@ -61,7 +60,7 @@ def test_a_search_at_rest_is_verified_unless_its_object_is_hardly_enrolled(sessi
 def test_a_measured_fit_replaces_the_enrolled_views(session) -> None:
     found = []
     for own in (0.1, 0.5, 0.9):
-        measured = PixelFit(session.end().object_index, own, 0.3, 0.3, 0.8)
+        measured = fitted(session.end().object_index, own, expected=0.8)
         assert answered(session.verify(lambda _: pytest.fail("no view is needed"), measured)) is measured
         assert session.decision == session.present == decide(session.belief, last=True, fit=measured)
         found.append(session.end().not_enrolled)
@@ -74,9 +73,9 @@ def test_a_good_fit_ends_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
     index = hbr.DenseIndex(catalog(objects=4))
     session = hbr.DenseSession(index)
     session.add(index.views.levels(np.array([0]))[0], 0.0)
-    with_fit = decide(session.belief, last=False, fit=PixelFit(0, 0.95, 0.2, 0.2, 0.9)).probability
+    with_fit = decide(session.belief, last=False, fit=fitted(0, 0.95, second=0.2, others=0.2, expected=0.9)).probability
     found_from(monkeypatch, with_fit)
     session = hbr.DenseSession(index)
     assert session.add(index.views.levels(np.array([0]))[0], 0.0).outcome is Outcome.CONTINUE
-    answered(session.verify(lambda _: [], PixelFit(0, 0.95, 0.2, 0.2, 0.9)))
+    answered(session.verify(lambda _: [], fitted(0, 0.95, second=0.2, others=0.2, expected=0.9)))
     assert session.decision.outcome is session.end().outcome is Outcome.FOUND

@@ -6,13 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Belief, DenseIndex, Outcome, StopReason, Views
-from hbr.dense.pixel_fit import PixelFit
 from hbr.dense.stopping import LAST_CONFIDENCE, MIN_CONFIDENCE, UNKNOWN_FROM, among_enrolled, decide, posterior
 from tests.fuzzing import examples
-from tests.hbr.dense.searches import LIGHT, belief_after, catalog, view
+from tests.hbr.dense.searches import LIGHT, belief_after, catalog, fitted, view
 
 QUERIES_DEG = (30.0, 150.0, 270.0, 330.0)
-GOOD, BAD = PixelFit(0, 0.9, 0.3, 0.3, 0.85), PixelFit(0, 0.3, 0.3, 0.3, 0.85)
+GOOD, BAD = fitted(0, 0.9), fitted(0, 0.3)
 INDEX = DenseIndex(catalog(12))
 STRANGE = catalog(3, seed=9)
 
@@ -84,7 +83,7 @@ def test_a_similar_enrolled_object_is_a_reason_for_two_names_and_one_that_is_not
     levels[twins.of(1)] = levels[twins.of(0)]
     index = DenseIndex(Views(levels, twins.azimuth_deg, twins.object_index, twins.object_names, twins.descriptor))
     belief = belief_after([view(twins, 0, deg) for deg in QUERIES_DEG[:2]], QUERIES_DEG[:2], index)
-    decisions = [decide(belief, last=True, fit=PixelFit(0, 0.9, 0.9 - by, 0.3, 0.85)) for by in (0.15, 0.5)]
+    decisions = [decide(belief, last=True, fit=fitted(0, 0.9, second=0.9 - by)) for by in (0.15, 0.5)]
     assert [found.outcome for found in decisions] == [Outcome.AMBIGUOUS, Outcome.FOUND]
     assert all(found.probability >= LAST_CONFIDENCE for found in decisions)
 
@@ -113,13 +112,19 @@ def test_the_better_fit_leads_among_twins() -> None:
     twin = type(views).of_object("twin", views.levels(own), views.azimuth_deg[own], views.descriptor)
     belief = search(0.0, index=DenseIndex(type(views).concatenate([views, twin])))
     for leader, other in ((2, 6), (6, 2)):
-        shares = [among_enrolled(belief, PixelFit(leader, 0.6 + by, 0.6, 0.2, 0.6)) for by in (0.0, 0.1, 0.3)]
+        shares = [
+            among_enrolled(belief, fitted(leader, 0.6 + by, second=0.6, others=0.2, expected=0.6))
+            for by in (0.0, 0.1, 0.3)
+        ]
         assert np.array(shares).sum(axis=1) == pytest.approx(1)
         leading = [one[leader] for one in shares]
         assert leading == sorted(leading)
         assert leading[0] == pytest.approx(shares[0][other], rel=1e-3)
         assert leading[-1] > 0.95
-        assert decide(belief, last=True, fit=PixelFit(leader, 0.9, 0.6, 0.2, 0.6)).object_index == leader
+        assert (
+            decide(belief, last=True, fit=fitted(leader, 0.9, second=0.6, others=0.2, expected=0.6)).object_index
+            == leader
+        )
         assert np.delete(shares[-1], [2, 6]) == pytest.approx(np.delete(belief.probability(), [2, 6]))
 
 
@@ -133,8 +138,15 @@ def test_a_more_similar_object_is_more_probable(count: int) -> None:
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
 def test_a_better_fit_raises_the_probability(share: float) -> None:
     belief = search(share)
-    fits = [PixelFit(2, own, 0.3, 0.3, 0.85) for own in (0.3, 0.5, 0.7, 0.9)]
+    fits = [fitted(2, own) for own in (0.3, 0.5, 0.7, 0.9)]
     probabilities = [decide(belief, last=True, fit=one).probability for one in fits]
     assert probabilities == sorted(probabilities)
     # the fit changes the probability of "not enrolled", and not which object leads
     assert {decide(belief, last=True, fit=one).object_index for one in fits} == {2}
+
+
+def test_another_light_than_at_the_enrollment_makes_an_object_less_probable() -> None:
+    belief = search(0.3)
+    probabilities = [posterior(belief, fitted(2, 0.7)._replace(light=by))[0][2] for by in (0.0, 0.1, 0.5, 1.0)]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert probabilities[-1] == posterior(belief, fitted(2, 0.7)._replace(light=30.0))[0][2]

@@ -10,7 +10,7 @@ import pytest
 
 from hbr import Belief, DenseIndex, Views, update_belief
 from hbr.core.angles import wrap180
-from hbr.dense.pixel_fit import LocalView, Pixels, fit
+from hbr.dense.pixel_fit import LocalView, Pixels, compare
 from hbr.dense.session import answered, verify
 from tests.hbr.dense.searches import catalog
 
@@ -38,17 +38,21 @@ def painted(
 
 def test_fit_is_high_for_the_same_object_in_other_light_and_low_for_another_object() -> None:
     enrolled = Pixels.of(painted(1))
-    same = fit(Pixels.of(painted(1, moved=(-6, 5), light=(0.7, 0.8, 1.05))), enrolled)
-    other = fit(Pixels.of(painted(2)), enrolled)
-    assert fit(enrolled, enrolled) > 0.95
-    assert same > 0.75
-    assert other < 0.5
+    same = compare(Pixels.of(painted(1, moved=(-6, 5), light=(0.7, 0.8, 1.05))), enrolled)
+    other = compare(Pixels.of(painted(2)), enrolled)
+    itself = compare(enrolled, enrolled)
+    assert itself.fit > 0.95
+    assert same.fit > 0.75
+    assert other.fit < 0.5
+    # the light: the mean of the three channels, and the ratios of red and blue to green
+    assert same.light == pytest.approx(np.log([0.85, 1.05 / 0.8, 0.7 / np.sqrt(0.8 * 1.05)]), abs=0.05)
+    assert itself.light == pytest.approx(np.zeros(3))
 
 
 def test_fit_stays_high_where_a_shade_lies_across_the_object() -> None:
     view = painted(1)
     shade = np.linspace(1, 0.5, SIDE)[:, None]
-    assert fit(Pixels.of(replace(view, crop=(view.crop * shade).astype(np.uint8))), Pixels.of(view)) > 0.75
+    assert compare(Pixels.of(replace(view, crop=(view.crop * shade).astype(np.uint8))), Pixels.of(view)).fit > 0.75
 
 
 @pytest.mark.parametrize("across", [False, True])
@@ -59,13 +63,13 @@ def test_no_scale_is_changed_where_only_the_colours_would_show_it(across: bool) 
     bright = 100 + half + half[:, None]  # at any scale the same four quarters
     crop = np.dstack([bright + tint, bright, bright - tint]).astype(np.uint8)
     view = Pixels.of(LocalView(crop, np.full((SIDE, SIDE), 255, np.uint8), 0.0))
-    assert fit(view, view) > 0.95
+    assert compare(view, view).fit > 0.95
 
 
 def test_nothing_is_explained_without_common_pixels() -> None:
     view = painted(1)
     nothing = LocalView(view.crop, np.zeros_like(view.mask), 0.0)
-    assert fit(Pixels.of(view), Pixels.of(nothing)) == 0
+    assert compare(Pixels.of(view), Pixels.of(nothing)).fit == 0
 
 
 @pytest.fixture(scope="module")
