@@ -94,19 +94,25 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-def share_firmware(cache: Path, base: Path) -> None:
-    """Let all workers of a run use the firmware that the first worker builds."""
-    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "firmware"
+@pytest.fixture(scope="session")
+def for_all_workers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder that all workers of a run share."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+def share_firmware(cache: Path, shared: Path) -> None:
+    """Let all programs that share a folder use the firmware that the first of them builds."""
     shared.mkdir(exist_ok=True)
     (cache / APP).mkdir(parents=True)
     (cache / APP / "head").symlink_to(shared)
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def _nobodys_home(tmp_path_factory: pytest.TempPathFactory, for_all_workers: Path) -> Iterator[None]:
     """Separate the tests from the data of the user who runs them, and remove their files."""
     home = tmp_path_factory.mktemp("home")
-    share_firmware(home / "cache", tmp_path_factory.getbasetemp())
+    share_firmware(home / "cache", for_all_workers / "firmware")
     get_temp_dir()  # Python removes this one at its own end
     with (
         TemporaryDirectory(prefix="rig-tests-", dir=home.parent, ignore_cleanup_errors=True) as temporary,

@@ -19,6 +19,7 @@ from sim.faults.schedule import FaultTrigger
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.faults.fault_runs import NOISE
+from tests.small import SMALL
 
 VOCABULARY = {
     *(f"{d}.{w}" for d in ("servo", "imu", "camera") for w in ("off", "stuck", "garbage", "wrong", "slow", "delayed")),
@@ -197,7 +198,7 @@ def test_moves_and_views_have_the_numbers_of_the_plan(tmp_path):
     planned = [Fault.parse(text) for text in ("clock_jump@move0", "clock_jump@move2", "black_frame@view2+0.3s")]
     begun = {}
     with (
-        open_sim_bench(load_config(), operator, faults=planned) as bench,
+        open_sim_bench(load_config(None, SMALL), operator, faults=planned) as bench,
         Catalog.open(tmp_path, clock=bench.clock) as c,
     ):
         assert operator.faults is not None

@@ -4,6 +4,7 @@
 [NAME ...]`` runs sessions and writes these files: read the difference before you commit it.
 """
 
+import fcntl
 import json
 import os
 import re
@@ -61,11 +62,14 @@ def expected(name: str) -> Values:
     return [json.loads(line) for line in (EXPECTED / f"{name}.jsonl").read_text().splitlines()]
 
 
-def played(name: str, folder: Path) -> Values:
-    """Run a session in a folder; return what it prints: each command, its values, and its exit code."""
+def played(name: str, folder: Path, others: Path) -> Values:
+    """Run a session in a folder; return what it prints: each command, its values, and its exit code.
+
+    The sessions that it begins from are in ``others`` (`left`).
+    """
     session = sessions()[name]
     for before in session.get("after", []):
-        shutil.copytree(left(before)[0], folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("stop"))
+        shutil.copytree(left(before, others)[0], folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("stop"))
     if "after" not in session:
         (folder / "rig.toml").write_text(CONFIG)
     for file, text in session.get("files", {}).items():
@@ -93,11 +97,18 @@ def _without_repetition(values: Values) -> Values:
     return values
 
 
-@cache
-def left(name: str) -> tuple[Path, Values]:
-    """Return the folder that a session leaves, and what the session prints."""
-    folder = Path(tempfile.mkdtemp())
-    return folder, played(name, folder)
+def left(name: str, others: Path) -> tuple[Path, Values]:
+    """Return the folder that a session leaves in ``others``, and what the session prints.
+
+    The first process that asks runs the session for all that share the folder, which wait for it.
+    """
+    folder, printed = others / name, others / f"{name}.json"
+    with (others / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not printed.exists():
+            folder.mkdir()
+            printed.write_text(json.dumps(played(name, folder, others)))
+    return folder, json.loads(printed.read_text())
 
 
 @contextmanager
@@ -265,10 +276,11 @@ def differences(stored: Any, now: Any, where: str = "") -> Iterator[str]:
 
 def main() -> None:
     EXPECTED.mkdir(exist_ok=True)
-    for name in sys.argv[1:] or sessions():
-        with tempfile.TemporaryDirectory() as folder:
-            lines = [json.dumps(value, ensure_ascii=False) for value in played(name, Path(folder))]
-        (EXPECTED / f"{name}.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    with tempfile.TemporaryDirectory() as others:
+        for name in sys.argv[1:] or sessions():
+            with tempfile.TemporaryDirectory() as folder:
+                lines = [json.dumps(value, ensure_ascii=False) for value in played(name, Path(folder), Path(others))]
+            (EXPECTED / f"{name}.jsonl").write_text("".join(f"{line}\n" for line in lines))
 
 
 if __name__ == "__main__":

@@ -156,7 +156,7 @@ def test_rotation_leaves_it_open_if_the_platter_has_marks_or_the_surroundings_mo
     assert emptiness(s, [first, marked, np.roll(rotated, 40, axis=1)]) == [None, None]
 
 
-@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.5, 0.5, 0.5)])
+@pytest.mark.parametrize("light", [pytest.param((1.0, 1.0, 1.0), marks=pytest.mark.nightly), (0.5, 0.5, 0.5)])
 def test_no_object_is_taken_for_nothing_although_it_looks_the_same_from_all_sides(simulated, light):
     s = simulated()
     for number, name in enumerate(shelf()):
