@@ -6,6 +6,8 @@ CORE   := .venv/.core
 READY  := .venv/.ready
 # One thread is faster here: with several threads, small matrix products wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
+# Many tests start the program, which compiles itself each time without stored bytecode.
+unexport PYTHONDONTWRITEBYTECODE
 
 LIBRARY := hbr/kernels/_kernels.so
 
