@@ -30,7 +30,7 @@ def motion_report(moves: Sequence[Mapping[str, Any]], *, bench: str, quiet_dps: 
         .get_template("motion.html.j2")
         .render(
             title=f"Motion of {bench}",
-            date="",
+            date=None,
             totals=[],
             summary=f"The last {counted(len(moves), 'move')}, the newest first. If a table rings, the rate by the gyro "
             "swings about 0 after the end of the servo's profile.",

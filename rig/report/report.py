@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 from statistics import fmean, median
@@ -67,7 +67,7 @@ class Meta:
 
     ``conditions`` determine the run (noise model, seed, versions): equal conditions give equal pages. ``wall_clock``
     has the values that differ between equal runs (duration, host); they are at the foot of the page. A value that is a
-    mapping becomes a group of rows. ``date`` is at the top.
+    mapping becomes a group of rows. ``date`` is at the top, in the time zone of this computer.
     """
 
     conditions: Mapping[str, Any] = field(default_factory=dict)
@@ -88,7 +88,7 @@ def render_report(
     with_truth = any(record.truth is not None for record in identifications)
     return _template().render(
         title=title,
-        date="" if meta.date is None else f"{meta.date.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
+        date=meta.date and meta.date.astimezone(),
         summary=summary,
         totals=list(totals(enrollments, identifications)),
         retrievals=[

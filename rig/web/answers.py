@@ -107,8 +107,8 @@ class BenchStatus(BaseModel):
     """The state of the bench, the data of the messages ``status``.
 
     ``job`` is the id of the running job. ``error`` says why the bench is not open; then all that only an open bench
-    knows is null. ``problem`` says why the queue could not be stored. ``doubt`` says why the table's angle must be
-    referenced: then ``table_deg`` is null. ``steps`` are the next steps of the operator. ``region`` is the part of the
+    knows is null. With an open bench, ``error`` says why the queue could not be stored. ``doubt`` says why the table's
+    angle must be referenced: then ``table_deg`` is null. ``steps`` are the next steps of the operator. ``region`` is the part of the
     picture that is described: x, y, width and height in pixels. ``locks`` are the settings that the camera holds.
     """
 
@@ -117,7 +117,6 @@ class BenchStatus(BaseModel):
     open: bool = False
     job: str | None = None
     error: Problem | None = None
-    problem: Problem | None = None
     picture_age_s: float | None = None
     bench: str | None = None
     state: TableState | None = None

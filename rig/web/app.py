@@ -23,9 +23,14 @@ from rig.web.problems import ProblemResponse
 from rig.web.requests import JobState
 from rig.web.server import API, Routes, Server, Watcher
 
+# With `model`, FastAPI would document errors with the media type of the answer: a JPEG, for a picture.
+_PROBLEM: Final = {ProblemResponse.media_type: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
 _ERRORS: Final[dict[int | str, dict[str, Any]]] = {
-    "4XX": {"model": Problem, "description": "The request cannot be carried out; `code` and `next_step` say why"},
-    "5XX": {"model": Problem, "description": "The bench or the catalog is not available"},
+    "4XX": {
+        "description": "The request cannot be carried out; `code` and `next_step` say why",
+        "content": _PROBLEM,
+    },
+    "5XX": {"description": "The bench or the catalog is not available", "content": _PROBLEM},
 }
 
 

@@ -380,12 +380,12 @@ class BenchWorker:
         self._publish_status(state)
 
     def _publish_status(self, state: ServoState | None) -> None:
-        bench, error = self._bench, self._error
+        bench = self._bench
+        error = self._error if bench is None else self.queue.problem
         self._status_ns = self._clock.now_ns()
         values: dict[str, Any] = {"open": bench is not None, "job": self._job.id if self._job else None}
-        values["error"] = error.problem if error is not None and bench is None else None
+        values["error"] = None if error is None else error.problem
         values["picture_age_s"] = self._picture.age_s
-        values["problem"] = None if (found := self.queue.problem) is None else found.problem
         if bench is not None:
             values |= bench_facts(bench, state)
             values |= {"camera": bench.camera.identity, "locks": self._locks, "region": bench.config.view.roi}

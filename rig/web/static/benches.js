@@ -1,5 +1,5 @@
 // The overview of several benches; the server asks them.
-import { $, act, h, on, request, start, stateWords } from "./rig.js";
+import { $, act, h, on, request, start, stateWords, when } from "./rig.js";
 
 const EVERY_MS = 3000;
 const cards = new Map(); // they stay, so that a link keeps the focus
@@ -15,7 +15,7 @@ async function load() {
     if (!cards.has(one.name)) cards.set(one.name, card(one));
     const { state, job, answer } = cards.get(one.name);
     const [words, kind] = one.problem ? [`This bench ${one.problem}.`, "bad"] : stateWords(one.status);
-    const time = one.answered_utc ? ` (${new Date(one.answered_utc).toLocaleTimeString()})` : "";
+    const time = one.answered_utc ? ` (${when(one.answered_utc)})` : "";
     state.className = kind === "bad" ? "error" : "";
     state.textContent = words;
     job.textContent = one.job ? `Job: ${one.job}` : "";

@@ -287,14 +287,15 @@ function showNextSteps(steps) {
 }
 
 on("status", (status) => {
-  showNextSteps((status.error ? status.error.steps : status.steps) || []);
+  const { error } = status;
+  showNextSteps([...(error && status.open ? [error.detail] : []), ...(error?.steps || []), ...(status.steps || [])]);
   showState(...stateWords(status));
 });
 
 /** Say what the catalog's server does not have, and how old the local copy is. */
 on("catalog", (state) => {
   const words = [...state.reasons];
-  if (state.local_copy_utc) words.unshift(`The server of the catalog does not answer. The pages and searches use the copy of ${state.local_copy_utc}.`);
+  if (state.local_copy_utc) words.unshift(`The server of the catalog does not answer. The pages and searches use the copy of ${when(state.local_copy_utc)}.`);
   if (state.waiting) words.push(`Objects and answers in the journal of the bench's computer that the server does not have yet: ${state.waiting}.`);
   $("catalog-state").replaceChildren(...words.map((text) => h("p", {}, text)));
 });

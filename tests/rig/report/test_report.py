@@ -1,6 +1,7 @@
 """The report is one self-contained file, shows the content of the records, and escapes all names."""
 
 import re
+import time
 from base64 import b64decode
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
@@ -102,9 +103,13 @@ def test_page_shows_the_content_of_the_records() -> None:
     assert len([a for a in page.all("svg") if "The leading candidates. score per view" in a["aria-label"]]) == 4
 
 
-def test_date_is_at_the_top() -> None:
+def test_date_is_at_the_top_in_the_zone_of_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+    time.tzset()
     page = Page(demo())
-    assert page.text.startswith("Demo Demo 2026-01-02 03:04 UTC Two objects.")
+    monkeypatch.undo()
+    time.tzset()
+    assert page.text.startswith("Demo Demo 2026-01-02 04:04 CET Two objects.")
     assert not Page(render_report("t", "s", [], [], meta=Meta())).all("time")
 
 

@@ -25,6 +25,7 @@ KINDS = {next(f.default for f in fields(kind) if f.name == "event") for kind in 
 
 COMMITTED = Path(__file__).parents[3] / "docs" / "reference" / "openapi.json"
 PUBLIC = {"get_health", "login", "logout"}
+PROBLEM = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 
 
 def made() -> dict[str, Any]:
@@ -50,6 +51,8 @@ def test_each_operation_has_a_plain_name_a_schema_for_its_answer_and_the_right_t
         (answer,) = (found for status, found in one["responses"].items() if status.startswith("2"))
         assert all(content["schema"] for content in answer["content"].values()), one["operationId"]
         assert one["operationId"].isidentifier()
+        failed = [found["content"] for status, found in one["responses"].items() if not status.startswith("2")]
+        assert failed == [PROBLEM, PROBLEM], one["operationId"]
         assert ("security" in one) == (one["operationId"] not in PUBLIC)
         roles = {role for way in one.get("security", ()) for needed in way.values() for role in needed}
         assert len(roles) == (one["operationId"] not in PUBLIC)
@@ -100,7 +103,9 @@ def test_reference_of_a_server_shows_each_operation_and_each_error_without_a_net
     for methods in document["paths"].values():
         assert all(f'id="{one["operationId"]}"' in page for one in methods.values())
     assert set(re.findall('href="#([^"]+)"', page)) <= set(re.findall('id="([^"]+)"', page))
-    problem = served.client.get("/api/v1/jobs/none").json()
+    answer = served.client.get("/api/v1/jobs/none")
+    assert answer.headers["content-type"] in PROBLEM
+    problem = answer.json()
     address, _, anchor = problem["type"].partition("#")
     errors = served.client.get(address).text
     assert f'<tr id="{anchor}"><td>{problem["code"]}</td>' in errors

@@ -14,10 +14,10 @@ from rig.calibrations import CalibrationStore
 from rig.catalog import Catalog
 from rig.config import load_config
 from rig.core.clock import SystemClock
-from rig.core.errors import DeviceNotFound
+from rig.core.errors import DeviceNotFound, StateNotStored
 from rig.devices.servo import ServoState
 from rig.doctor.examination import run_checks
-from rig.safety.saved_state import SESSION
+from rig.safety.saved_state import SERVER_FOLDER, SESSION
 from rig.safety.stop_channel import StopAnswer, StopRequest
 from rig.web.requests import GotoRequest, JobRequest
 from rig.web.setup import Listening, Setup
@@ -55,6 +55,17 @@ def halted(monkeypatch) -> Halted:
 
     monkeypatch.setattr("rig.web.worker.open_bench", opened)
     return halt
+
+
+def test_status_says_that_the_list_of_jobs_was_damaged(serve, tmp_path):
+    list_of_jobs = tmp_path / "state" / "sim" / SERVER_FOLDER / "jobs.json"
+    list_of_jobs.parent.mkdir(parents=True)
+    list_of_jobs.write_text("damaged")
+    served = serve().opened()
+    error = served.client.get("/api/v1/status").json()["error"]
+    assert (error["code"], error["detail"]) == (StateNotStored.code, f"The list of jobs in {list_of_jobs} is damaged.")
+    assert served.run(kind="goto", angle_deg=5)["state"] == "done"
+    assert served.client.get("/api/v1/status").json()["error"] is None
 
 
 def test_view_is_taken_again_and_the_others_stay(serve):
