@@ -44,7 +44,7 @@ def main() -> None:
             if options.every:
                 every(page, url, NAMES, options.every, "")
         if options.every:
-            with served(folder, "bench.sim.speed=0.7", "enroll.views=72") as url:
+            with served(folder, "bench.sim.speed=0.7", "enroll.views=72", 'bench.sim.object="radio"') as url:
                 submit(url, kind="enroll", name="radio")
                 submit(url, kind="tray", objects=[{"name": "vase", "label": "shelf 2"}, {"name": "dice"}])
                 every(page, url, ("", "enroll"), options.every, "job-")

@@ -215,6 +215,9 @@ class BenchWorker:
 
     def _run(self, job: Job) -> None:
         self._job = job
+        # A job may ask before it reads the servo: until then, only this changes.
+        self.status = self.status.model_copy(update={"job": job.id})
+        self.publish("status", self.status)
         self._stops_before = self.queue.heeded
         self.views[job.id] = []
         for old in list(self.views)[:-JOBS_WITH_PICTURES]:

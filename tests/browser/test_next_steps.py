@@ -18,7 +18,8 @@ def test_fault_is_acknowledged_on_any_page(page, serve_process, stored, tmp_path
     settings = ['bench.sim.faults=["jam@move0", "jam@move1"]']
     server = serve_process(*settings, *([] if stored else ["state_dir=none"]))
     rotate(page, server, 90)
-    page.wait_for_selector("#next-steps:has-text('Remove what blocks the table')")
+    page.wait_for_selector("#state:text-is('Fault 505')")
+    page.wait_for_selector("#next-steps:has-text('The table is blocked'):has-text('Remove what blocks the table')")
     page.goto(f"{server.url}enroll")
     page.click("#next-steps button:has-text('Acknowledge the fault')")
     page.wait_for_selector("#state:has-text('Ready')")

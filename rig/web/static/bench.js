@@ -121,7 +121,7 @@ async function showMove() {
   const points = (values) => move.time_s.map((time, k) => [time, values[k]]);
   $("move").replaceChildren(
     lineChart([{ name: "table", colour: "c0", points: points(move.encoder_deg) }, { name: "planned", colour: "c1", dashed: true, points: points(move.profile_deg) }], { label: "Angle of the table during the last move", unit: "°" }),
-    h("p", { class: "small soft" }, `From ${number(move.from_deg, 1)}° to ${number(move.to_deg, 1)}°, at rest after ${move.settled_s === null ? "–" : `${move.settled_s.toFixed(2)} s`}. Largest load ${number(Math.max(...move.load_percent.map(Math.abs)), 0)} %.`),
+    h("p", { class: "small soft" }, `From ${number(move.from_deg, 1)}° to ${number(move.to_deg, 1)}°, ${move.settled_s === null ? "not finished" : `at rest after ${move.settled_s.toFixed(2)} s`}. Largest load ${number(Math.max(...move.load_percent.map(Math.abs)), 0)} %.`),
   );
 }
 

@@ -14,10 +14,10 @@ async function load() {
   for (const one of (await request("GET", "/benches")).items) {
     if (!cards.has(one.name)) cards.set(one.name, card(one));
     const { state, job, answer } = cards.get(one.name);
-    const [words, kind] = one.problem ? [`This bench ${one.problem}.`, "bad"] : stateWords(one.status);
+    const [words, kind, why] = one.problem ? [`This bench ${one.problem}.`, "bad"] : stateWords(one.status);
     const time = one.answered_utc ? ` (${when(one.answered_utc)})` : "";
     state.className = kind === "bad" ? "error" : "";
-    state.textContent = words;
+    state.textContent = why || words;
     job.textContent = one.job ? `Job: ${one.job}` : "";
     answer.textContent = one.answer ? `Last answer: ${one.answer}${time}` : "";
   }

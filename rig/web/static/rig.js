@@ -267,11 +267,11 @@ function showState(words, kind) {
   $("state").className = `state ${kind}`;
 }
 
-/** Return the state of the bench in words, and whether it is good or bad. */
+/** Return the state of the bench in words, whether it is good or bad, and the reason for a bad one. */
 export function stateWords(status) {
-  if (!status.open) return [status.error ? `Bench not available: ${status.error.detail}` : "Opening the bench …", "bad"];
-  if (status.fault) return [`Fault ${status.fault.code}: ${status.fault.detail}`, "bad"];
-  if (status.doubt) return [`The table's angle is in doubt: ${status.doubt}.`, "bad"];
+  if (!status.open) return [status.error ? "Bench not available" : "Opening the bench …", "bad", status.error?.detail];
+  if (status.fault) return [`Fault ${status.fault.code}`, "bad", status.fault.detail];
+  if (status.doubt) return ["Angle in doubt", "bad", `The table's angle is in doubt: ${status.doubt}.`];
   const angle = status.table_deg === null || status.table_deg === undefined ? "" : `, table at ${number(status.table_deg, 1)}°`;
   return [`${status.job ? "Working" : "Ready"}${angle}`, status.job ? "good busy" : "good"];
 }
@@ -287,9 +287,12 @@ function showNextSteps(steps) {
 }
 
 on("status", (status) => {
-  const { error } = status;
-  showNextSteps([...(error && status.open ? [error.detail] : []), ...(error?.steps || []), ...(status.steps || [])]);
-  showState(...stateWords(status));
+  const [words, kind, why] = stateWords(status);
+  showState(words, kind);
+  // The error of an open bench is about its list of jobs, and stops nothing.
+  const listError = status.open && status.error ? [status.error.detail, ...status.error.steps] : [];
+  const steps = status.open ? status.steps : status.error?.steps;
+  showNextSteps([...(why ? [why] : []), ...(steps || []), ...listError]);
 });
 
 /** Say what the catalog's server does not have, and how old the local copy is. */
@@ -398,7 +401,7 @@ const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "
 const ENDED = ["done", "failed", "cancelled", "interrupted"];
 const ACTIVE = ["running", "paused", "waiting"];
 const STATES = { proposed: "waits for an approval", queued: "waits for the bench", waiting: "waits for you", failed: "not finished", cancelled: "stopped" };
-const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "Stop" };
+const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "End here" };
 export const isEnded = (job) => ENDED.includes(job.state);
 
 export function jobTitle(job) {
