@@ -108,8 +108,9 @@ class BenchStatus(BaseModel):
 
     ``job`` is the id of the running job. ``error`` says why the bench is not open; then all that only an open bench
     knows is null. With an open bench, ``error`` says why the queue could not be stored. ``doubt`` says why the table's
-    angle must be referenced: then ``table_deg`` is null. ``steps`` are the next steps of the operator. ``region`` is the part of the
-    picture that is described: x, y, width and height in pixels. ``locks`` are the settings that the camera holds.
+    angle must be referenced: then ``table_deg`` is null. ``steps`` are the next steps of the operator. ``region`` is
+    the part of the picture that is described: x, y, width and height in pixels. ``locks`` are the settings that the
+    camera holds.
     """
 
     model_config = ConfigDict(extra="forbid", json_schema_serialization_defaults_required=True)

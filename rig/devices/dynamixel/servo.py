@@ -174,9 +174,7 @@ class DynamixelServo:
             )
         settings.write(self.bus, self._id, self._table, differences)
         self._kept |= {d.register: d.wanted for d in differences}
-        return tuple(
-            f"servo set up for the rig: {d.reason} ({d.register} {d.found} → {d.wanted})" for d in differences
-        )
+        return tuple(f"servo set up for the rig: {d.reason} ({d.register} {d.found} → {d.wanted})" for d in differences)
 
     def setting_differences(self) -> list[SettingDifference]:
         """Return the EEPROM settings that differ from what the rig needs."""
