@@ -8,6 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from rig.config import load_config
 from rig.web.app import create_app
 from rig.web.setup import Listening, Setup
+from tests.browser.conftest import WAIT_S
 from tests.rig.web.conftest import connected
 
 schemathesis = pytest.importorskip("schemathesis", reason="Schemathesis is missing: make test-web installs it")
@@ -37,7 +38,7 @@ def test_no_request_causes_a_server_error(schema):
         @given(operation.as_strategy())
         @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
         def attack(case):
-            answer = case.call()
+            answer = case.call(timeout=WAIT_S)
             seen.setdefault(case.operation.label, set()).add(answer.status_code)
             assert answer.status_code < 500 or answer.status_code == 503, (case.as_curl_command(), answer.text)
             if answer.status_code >= 400:
