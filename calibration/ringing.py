@@ -40,10 +40,12 @@ LAGS_S = (0.02, 0.045, 0.1)
 """Where the fit begins."""
 MAX_RESIDUAL = 3.0
 """Largest scatter about the fit, in that of its end: more is a second oscillation, or a hand."""
-MIN_PEAK = 6.0  # a smaller one does not determine a frequency
-"""Smallest rate after a stop, in the scatter of the end."""
-MAX_UNCERTAINTY = 0.02
-"""Largest relative uncertainty of the frequency: with twice as much, a shaped motion rings by a tenth."""
+CLEAR_PEAK, MIN_PEAK = 6.0, 2.0  # of noise alone, the fits that seem certain have less than 1
+"""Rates after a stop, in the scatter of the end: a smaller one is no ringing if its frequency is not certain, or in any
+case."""
+MAX_UNCERTAINTY, MAX_OF_DAMPING = 0.02, 0.25
+"""Largest relative uncertainty of the frequency, at least this share of the damping ratio: with twice as much, a shaped
+motion rings by a tenth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +103,18 @@ class Ringing(Procedure):
                 goto(base_deg)
                 for index in range(self.stops):
                     move = goto(base_deg + (SWING_DEG if index % 2 == 0 else 0.0))
+                    rests_deg = []  # each reading is rounded to a count; their mean is finer
                     for _round in range(round(LISTEN_S / 0.2)):  # less than a sensor's FIFO holds
                         bench.clock.sleep(0.2)
                         table.collect_gyro()
+                        rests_deg.append(table.angle_deg())
                     stops.append(Stop.of(table.moves[-1]))
-                    held_deg.append(abs(move.commanded_deg - move.encoder_deg))
+                    goal_deg = table.moves[-1].readings[-1][2]  # the servo's own, rounded to a count as well
+                    held_deg.append(
+                        abs((move.commanded_deg if goal_deg is None else goal_deg) - float(np.mean(rests_deg)))
+                    )
                     yield moved(index, move)
-        yield evaluate(stops, float(np.median(held_deg)))
+        yield evaluate(stops, float(np.mean(held_deg)))
 
 
 def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
@@ -128,7 +135,10 @@ def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
         return found.reject(RejectionCode.NO_RINGING, peak_dps=peak_dps, noise_dps=noise_dps)
     without = np.array([_fit([*used[:i], *used[i + 1 :]], fitted) for i in range(len(used))])
     sigma = np.sqrt((len(used) - 1) * without.var(axis=0))
-    lags = tail_dps > MIN_PEAK * noise_dps  # else its time is that of noise
+    limit_hz = max(MAX_UNCERTAINTY, MAX_OF_DAMPING * damping) * hz
+    if peak_dps < CLEAR_PEAK * noise_dps and sigma[0] > limit_hz:
+        return found.reject(RejectionCode.NO_RINGING, peak_dps=peak_dps, noise_dps=noise_dps)
+    lags = tail_dps > CLEAR_PEAK * noise_dps  # else its time is that of noise
     for index, (name, unit) in enumerate((("frequency", "Hz"), ("damping", ""), *((("lag", "s"),) if lags else ()))):
         scatter = Contribution("scatter of the stops (jackknife)", "A", float(sigma[index]), unit)
         found.estimate(name, fitted[index], unit, scatter)
@@ -146,7 +156,11 @@ def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
     }
     found.reject_if(residual > MAX_RESIDUAL, RejectionCode.RINGING_UNCLEAR, residual=residual)
     found.reject_if(
-        sigma[0] > MAX_UNCERTAINTY * hz, RejectionCode.RINGING_UNCERTAIN, hz=hz, uncertainty_hz=float(sigma[0])
+        sigma[0] > limit_hz,
+        RejectionCode.RINGING_UNCERTAIN,
+        hz=hz,
+        uncertainty_hz=float(sigma[0]),
+        limit_hz=limit_hz,
     )
     return found
 

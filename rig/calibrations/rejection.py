@@ -61,8 +61,8 @@ class RejectionCode(Enum):
         "other machines off the bench. If the object on the table rocks, fasten it."
     )
     RINGING_UNCERTAIN = (
-        "The platter rings at {hz:.1f} Hz with an uncertainty of {uncertainty_hz:.2f} Hz, more than 2 %. Give more "
-        "stops."
+        "The platter rings at {hz:.1f} Hz with an uncertainty of {uncertainty_hz:.2f} Hz, more than "
+        "{limit_hz:.2f} Hz. Give more stops."
     )
     CABLE_ENDS_SWAPPED = (
         "The counter-clockwise end ({high_deg:.0f}°) lies below the clockwise end ({low_deg:.0f}°): the ends were "

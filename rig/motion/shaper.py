@@ -16,15 +16,19 @@ the lower speed. If that is late, the table still stops at the goal, but rings.
 
 The shaft follows this profile with the lag τ of its controller. That is linear: the ringing ends with the profile,
 and its rate is smaller by |1 + λτ|. But the shaft still moves then, with a speed that falls by exp(−t/τ): it is τ times
-the same sum of all Δa, with exp(−s/τ) instead of E(s). Friction is not linear: it holds the shaft until its profile is
-ahead by some angle. If the profile has to move by d for that, the shaft begins t₀ = √(2d/a) later, with the speed a·t₀.
-Then 1·E(T) is replaced by (1 + λ·t₀)·E(T − t₀).
+the same sum of all Δa, with exp(−s/τ) instead of E(s).
+
+Friction is not linear. After a motion in the other direction, it holds the shaft until its profile has moved by twice
+the angle at which it held it. The shaft then breaks away with the speed w of its profile, a push that leaves the rate
+w/|1 + λτ|. With full acceleration no other part of a motion of 3° can cancel it. So the profile creeps while the shaft
+breaks away, and accelerates from w afterwards. In S, 1 − E(−v/a) becomes 1 − E((w − v)/a), and the push at the time t
+before the acceleration adds λw/a·E(T + t).
 
 Singer and Seering, "Preshaping command inputs to reduce system vibration", 1990.
 """
 
 from dataclasses import dataclass
-from math import copysign, pi, sqrt
+from math import ceil, copysign, pi, sqrt
 from typing import Final
 
 import numpy as np
@@ -45,6 +49,10 @@ QUIET_SHARE: Final = 0.35  # the gyro's noise needs the rest
 """Share of `table.quiet_dps` that the ringing may have at the end."""
 TAIL_SHARE: Final = 0.9
 """The same of a shaft that lags behind, whose speed decreases further while the table must be quiet."""
+CREEP_DPS: Final = 1.0  # larger: the platter gets a push at an uncertain time; smaller: a reversal takes longer
+"""Least speed of the profile while the shaft breaks away."""
+SLACK_DEG: Final = 0.1  # an encoder's count, and a tenth of a usual friction
+"""How well the angle is known at which the shaft breaks away."""
 CRUISES, SLOWS, RAMPS = 12, 64, 4
 """Number of values of v, u and a that are compared."""
 LEAST_RAMP: Final = 0.45
@@ -53,16 +61,52 @@ LEAST_RAMP: Final = 0.45
 
 @dataclass(frozen=True, slots=True)
 class ShapedMove:
-    """A motion: its profile, that of its last part, when that is to begin, and how long the shaft moves.
+    """A motion: its profiles, each with the time at which it begins, and how long the shaft moves.
 
     ``rings_s`` is how long the platter rings afterwards, by more than it may at rest.
     """
 
-    cruise: MotionProfile
-    slow: MotionProfile
-    slow_s: float
+    parts: tuple[tuple[float, MotionProfile], ...]
     seconds: float
     rings_s: float
+
+    @property
+    def cruise(self) -> MotionProfile:
+        """The fastest of its profiles."""
+        return max((profile for _, profile in self.parts), key=lambda profile: profile.velocity_dps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """The beginning of a motion, until the shaft has broken away from its friction: profiles, duration, angle, speed.
+
+    The shaft breaks away ``pushed_s`` before its end.
+    """
+
+    parts: tuple[tuple[float, MotionProfile], ...] = ()
+    seconds: float = 0.0
+    moved_deg: float = 0.0
+    dps: float = 0.0
+    pushed_s: float = 0.0
+
+    @classmethod
+    def from_friction(cls, stays_deg: float, usual: MotionProfile, units: MotionProfile) -> "_Start":
+        """Return the beginning for a shaft that stays until its profile has moved by ``stays_deg``."""
+        unit_dps, a = units.velocity_dps, usual.acceleration_dps2
+        creep_dps, quick_deg = ceil(CREEP_DPS / unit_dps) * unit_dps, stays_deg - SLACK_DEG
+        if quick_deg <= 0:
+            return cls()
+        creeps_s = 2 * SLACK_DEG / creep_dps
+        quick_dps = min(usual.velocity_dps, sqrt(quick_deg * a)) // unit_dps * unit_dps
+        if quick_dps <= creep_dps:
+            quick_dps, brakes_s, quick_s = creep_dps, 0.0, quick_deg / creep_dps + creep_dps / a / 2
+        else:
+            brakes_s = quick_deg / quick_dps + creep_dps**2 / (2 * a * quick_dps)
+            quick_s = brakes_s + (quick_dps - creep_dps) / a
+        parts = [(0.0, MotionProfile(quick_dps, a))]
+        if brakes_s:
+            parts.append((brakes_s, MotionProfile(creep_dps, a)))
+        return cls(tuple(parts), quick_s + creeps_s, stays_deg + SLACK_DEG, creep_dps, creeps_s / 2)
 
 
 def shaped(
@@ -73,17 +117,22 @@ def shaped(
     ``usual`` has the largest speed and acceleration, ``units`` the smallest steps of both. ``behind_deg`` is by
     how much the shaft is behind its profile before the motion, as an angle with the same sign as the distance.
     """
-    distance, ringing_hz, damping = abs(distance_deg), config.ringing_hz, config.ringing_damping
-    stays_deg = max(config.held_deg - copysign(1.0, distance_deg) * behind_deg, 0.0)
+    ringing_hz, damping = config.ringing_hz, config.ringing_damping
+    stays_deg = config.held_deg - copysign(1.0, distance_deg) * behind_deg
+    if abs(stays_deg - 2 * config.held_deg) < SLACK_DEG:  # the calibration knows it better than a reading does
+        stays_deg = 2 * config.held_deg
+    start = _Start.from_friction(stays_deg, usual, units)
+    distance, w = abs(distance_deg) - start.moved_deg, start.dps
+    if distance <= 0:
+        return None
     ramp = _multiples(LEAST_RAMP * usual.acceleration_dps2, usual.acceleration_dps2, units.acceleration_dps2, RAMPS)
-    fastest = min(usual.velocity_dps, sqrt(distance * usual.acceleration_dps2))
+    fastest = min(usual.velocity_dps, sqrt(distance * usual.acceleration_dps2 + w * w / 2))
     a = ramp[:, None, None]
-    v = _multiples(fastest / 2, fastest, units.velocity_dps, CRUISES)[None, :, None]
+    v = _multiples(max(fastest / 2, w), fastest, units.velocity_dps, CRUISES)[None, :, None]
     u = _multiples(0.0, fastest, units.velocity_dps, SLOWS)[None, None, :]
     if not v.size or not u.size:
         return None
     first, last = (v - u) / a, u / a
-    late_s = np.sqrt(2 * stays_deg / a)
 
     def pole(hz: float) -> complex:
         return 2 * pi * hz * complex(-damping, sqrt(1 - damping**2))
@@ -91,13 +140,16 @@ def shaped(
     def response(hz: float, seconds: Floats) -> NDArray[np.complex128]:
         return np.asarray(np.exp(pole(hz) * seconds))
 
+    def cruise_s(p: Floats) -> Floats:
+        return (distance - (v * v - w * w / 2) / a - u * p) / v
+
     def motion_s(p: Floats) -> Floats:
-        return distance / v + v / a + p * (1 - u / v)
+        return (2 * v - w) / a + cruise_s(p) + p
 
     def left(hz: float, p: Floats) -> NDArray[np.complex128]:
         """Return S without its middle term."""
-        start = (1 + pole(hz) * late_s) * response(hz, -late_s) - response(hz, -v / a)
-        return response(hz, motion_s(p)) * start + 1 - response(hz, last)
+        begun = 1 - response(hz, (w - v) / a) + pole(hz) * w / a * response(hz, np.array(start.pushed_s))
+        return response(hz, motion_s(p)) * begun + 1 - response(hz, last)
 
     # The time p with which the middle term has the opposite phase; it changes the duration, so this is repeated.
     middle = response(ringing_hz, last) * (1 - response(ringing_hz, first))
@@ -117,20 +169,16 @@ def shaped(
     slowed = np.exp(-(p + last) / lag_s) * (1 - np.exp(-np.maximum(first, 0) / lag_s))
     speed_dps = a * lag_s * (1 - np.exp(-last / lag_s) + slowed)
     tail_s = lag_s * np.log(np.maximum(speed_dps / (TAIL_SHARE * config.quiet_dps), 1.0))
-    cruise_s = (distance - v * v / a - u * p) / v
-    possible = (cruise_s >= 0) & (first >= 0) & (v >= a * late_s)
-    rest_s = np.where(possible, motion_s(p) + tail_s + 2 * dying_s, np.inf)
+    rest_s = np.where((cruise_s(p) >= 0) & (first >= 0), motion_s(p) + tail_s + 2 * dying_s, np.inf)
     best = np.unravel_index(int(np.argmin(rest_s)), rest_s.shape)
     if not np.isfinite(rest_s[best]):
         return None
     acceleration, cruise, slow = float(ramp[best[0]]), float(v[0, best[1], 0]), float(u[0, 0, best[2]])
-    return ShapedMove(
-        MotionProfile(cruise, acceleration),
-        MotionProfile(slow, acceleration),
-        cruise / acceleration + float(cruise_s[best]),
-        float((motion_s(p) + tail_s)[best]),
-        float(dying_s[best]),
-    )
+    parts = [*start.parts, (start.seconds, MotionProfile(cruise, acceleration))]
+    if slow != cruise:
+        brakes_s = (cruise - w) / acceleration + float(cruise_s(p)[best])
+        parts.append((start.seconds + brakes_s, MotionProfile(slow, acceleration)))
+    return ShapedMove(tuple(parts), start.seconds + float((motion_s(p) + tail_s)[best]), float(dying_s[best]))
 
 
 def _multiples(low: float, high: float, unit: float, count: int) -> Floats:

@@ -222,8 +222,9 @@ class Turntable(AbstractContextManager["Turntable"]):
                 for goal_deg in waypoints:
                     # The table must rest only at the last stop; at the others it is enough to arrive.
                     quiet_s = self._config.quiet_s if goal_deg is waypoints[-1] else 0.0
-                    self._start(goal_deg, quiet_s, rotation)
-                    self._wait_for_rest(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg), rotation)
+                    cruise = self._start(goal_deg, quiet_s, rotation)
+                    allowed_s = self._allowed_s(goal_deg - self._rest_deg, cruise)
+                    self._wait_for_rest(goal_deg, quiet_s, allowed_s, rotation)
             self._arrive(motion)
         return self._end(rotation, target_deg)
 
@@ -260,7 +261,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             rotation = self._begin(*ends_deg)
             with self._safety.motion((rotation.start_deg, *ends_deg), self._stop) as motion:
                 with causes_found(self._servo, self._limits):
-                    rotation.monitor = self._monitor(self._rest_deg, target_deg)
+                    rotation.monitor = self._monitor(self._rest_deg, target_deg, self._torque_profile())
                     self._servo.arm_watchdog(self._config.watchdog_s)
                     self._set_goal(target_deg)
                     target_deg = self._wait_in_flight(target_deg, flight, rotation)
@@ -359,8 +360,8 @@ class Turntable(AbstractContextManager["Turntable"]):
             rotation.slip = SlipMonitor(self._limits, self._rest_deg) if self._trust_gyro else None
         return rotation
 
-    def _start(self, goal_deg: float, quiet_s: float, rotation: _Rotation) -> None:
-        """Start a motion; if the platter's ringing is known, one that does not excite it."""
+    def _start(self, goal_deg: float, quiet_s: float, rotation: _Rotation) -> MotionProfile:
+        """Start a motion; if the platter's ringing is known, one that does not excite it. Return its cruise."""
         config, clock = self._config, self._clock
         plan, rotation.due = None, deque()
         if config.ringing_hz:
@@ -372,27 +373,30 @@ class Turntable(AbstractContextManager["Turntable"]):
         if plan is None:
             self._use(self._usual)
         else:
-            self._profile = self._servo.set_profile(plan.cruise)
+            self._profile = self._servo.set_profile(plan.parts[0][1])
         asking_s = seconds_between(asked_ns, clock.now_ns())
-        rotation.monitor = self._monitor(self._rest_deg, goal_deg)
+        cruise = self._usual if plan is None else plan.cruise
+        rotation.monitor = self._monitor(self._rest_deg, goal_deg, cruise)
         self._servo.arm_watchdog(config.watchdog_s)
         begun_ns = clock.now_ns()
         self._set_goal(goal_deg)
         if plan is None:
-            return
+            return cruise
 
-        def slow_down() -> None:
-            self._use(plan.slow)
-            clock.sleep(plan.slow_s - seconds_between(begun_ns, clock.now_ns()))
+        def change_to(profile: MotionProfile, at_s: float) -> None:
+            self._use(profile)
+            clock.sleep(at_s - seconds_between(begun_ns, clock.now_ns()))
             self._set_goal(goal_deg)
 
         # The readings at the end follow the motion closely, so that a table at rest is not waited for.
         ends_s = plan.seconds + GYRO_LAG_S
         rests_s = ends_s + quiet_s + GYRO_LAG_S / 4
         times_s = (ends_s, rests_s, rests_s + plan.rings_s) if quiet_s else (ends_s,)
-        if plan.slow != plan.cruise:
-            rotation.due.append((begun_ns + round((plan.slow_s - asking_s) * 1e9), slow_down))
+        for at_s, profile in plan.parts[1:]:
+            change = partial(change_to, profile, at_s)
+            rotation.due.append((begun_ns + round((at_s - asking_s) * 1e9), change))
         rotation.due.extend((begun_ns + round(after_s * 1e9), lambda: None) for after_s in times_s)
+        return cruise
 
     def _pause(self, rotation: _Rotation | None) -> None:
         config, clock = self._config, self._clock
@@ -455,18 +459,18 @@ class Turntable(AbstractContextManager["Turntable"]):
             by_gyro,
         )
 
-    def _monitor(self, start_deg: float, goal_deg: float) -> MotionMonitor:
+    def _monitor(self, start_deg: float, goal_deg: float, cruise: MotionProfile) -> MotionMonitor:
         return MotionMonitor(
             self._limits,
             self._servo.limits,
             start_deg=start_deg,
             goal_deg=goal_deg,
             tolerance_deg=self._config.tolerance_deg,
-            cruise_dps=self._torque_profile().velocity_dps,
+            cruise_dps=cruise.velocity_dps,
         )
 
-    def _allowed_s(self, distance_deg: float) -> float:
-        return 1.5 * motion_seconds(distance_deg, self._torque_profile()) + self._settle_s
+    def _allowed_s(self, distance_deg: float, cruise: MotionProfile) -> float:
+        return 1.5 * motion_seconds(distance_deg, cruise) + self._settle_s
 
     def _wait_for_rest(
         self, goal_deg: float, quiet_s: float, allowed_s: float, rotation: _Rotation | None = None
@@ -488,7 +492,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         """Record and steer until the table has arrived; return the last goal."""
         low_deg, high_deg = flight.reach_deg
         quiet_s = self._config.quiet_s if flight.quiet else 0.0
-        arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg))
+        cruise = self._torque_profile()
+        arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg, cruise))
         rest_deg = None
         while rest_deg is None:
             # The next frame may change the goal.
@@ -502,8 +507,8 @@ class Turntable(AbstractContextManager["Turntable"]):
                 # If the goal is behind the table, it overshoots before it comes back.
                 stop_deg = self.stopping_deg(state)
                 farthest_deg = stop_deg if abs(stop_deg - goal_deg) > abs(angle_deg - goal_deg) else angle_deg
-                rotation.monitor = self._monitor(farthest_deg, goal_deg)
-                arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - angle_deg))
+                rotation.monitor = self._monitor(farthest_deg, goal_deg, cruise)
+                arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - angle_deg, cruise))
             self._check(state, angle_deg, rotation)
             rest_deg = arrival.rest_deg(state, angle_deg)
         self._rest_deg = rest_deg

@@ -12,10 +12,11 @@ from sim.noise import NoiseModel
 from tests.calibration.rejected import codes
 from tests.rig.bench_parts import LAG_S, at_rest, motion_bench
 
-OTHERS = [(6.0, 0.2), (9.0, 0.06), (13.0, 0.15), (20.0, 0.02)]
+FREQUENCIES_HZ, DAMPINGS = (6.0, 9.0, 13.0, 20.0), (0.02, 0.05, 0.2)
+OTHERS = [(hz, damping) for hz in FREQUENCIES_HZ for damping in DAMPINGS][1:]
 TABLES = [(6.0, 0.02), *(pytest.param(*table, marks=pytest.mark.nightly) for table in OTHERS)]
 """Frequency and damping of the simulated platter."""
-UPWARDS_DEG, DOWNWARDS_DEG = (40.0, 85.0, 95.0, 190.0), (150.0, 20.0)
+TARGETS_DEG = (10.0, 40.0, 35.0, 130.0, 30.0, 210.0, 30.0)
 
 
 def drawn(rng: np.random.Generator, hz: float, damping: float) -> list[Stop]:
@@ -46,25 +47,21 @@ def test_calibrated_table_is_at_rest_at_once(hz, damping):
         *_, found = Ringing(6).measure(bench)
         assert isinstance(found, Evaluation)
         assert found.passed, found.rejections
-        # The lag of the servo excites the platter less: its ringing is known a little less well.
-        assert found.estimates["frequency"].value == pytest.approx(hz, rel=0.01)
-        assert found.estimates["damping"].value == pytest.approx(damping, rel=0.05)
+        # The lag of the servo filters the ringing: a platter with much damping is known less well.
+        for name, truth, limit in (("frequency", hz, 0.01 * hz), ("damping", damping, 0.05 * damping)):
+            estimate = found.estimates[name]
+            assert estimate.value == pytest.approx(truth, abs=max(limit, 3 * estimate.uncertainty))
         assert found.estimates["lag"].value == pytest.approx(LAG_S, rel=0.05)
         ringing = {key.removeprefix("table."): value for key, value in found.settings.items()}
-        assert ringing["held_deg"] == pytest.approx(wires.device.motor.held_deg, abs=0.05)
-        assert max(settling_s(bench, wires, UPWARDS_DEG, **ringing)) < 0.15
-        # Before its approach from below, friction holds the shaft. When it breaks away, the platter gets a push that is
-        # known as well as the friction: to some 0.2°. It dies down with the platter's damping.
-        omega = 2 * np.pi * hz
-        dies_down_s = np.log(omega * 0.2 / bench.config.table.quiet_dps) / (damping * omega)
-        assert max(settling_s(bench, wires, DOWNWARDS_DEG, **ringing)) < 0.15 + dies_down_s
+        assert ringing["held_deg"] == pytest.approx(wires.device.motor.held_deg, abs=0.02)
+        assert max(settling_s(bench, wires, TARGETS_DEG, **ringing)) < 0.15
 
 
 def test_ringing_that_the_lag_of_the_servo_does_not_excite_needs_no_calibration():
-    with motion_bench(noise=NoiseModel(structure_hz=20.0, structure_damping=0.1), seed=3) as (bench, wires):
+    with motion_bench(noise=NoiseModel(structure_hz=20.0, structure_damping=0.3), seed=3) as (bench, wires):
         *_, found = Ringing(6).measure(bench)
         assert codes(found) == [RejectionCode.NO_RINGING]
-        times_s = settling_s(bench, wires, UPWARDS_DEG + DOWNWARDS_DEG)
+        times_s = settling_s(bench, wires, TARGETS_DEG)
         assert max(times_s) < 0.15 + 2 * bench.config.table.poll_s
 
 
@@ -74,7 +71,7 @@ def test_table_with_little_damping_never_rests_without_calibration():
         motion_bench(noise=noise, seed=3) as (bench, wires),
         pytest.raises(MotionTimeout, match="did not come to rest"),
     ):
-        settling_s(bench, wires, UPWARDS_DEG)
+        settling_s(bench, wires, TARGETS_DEG)
 
 
 @pytest.mark.nightly
