@@ -11,7 +11,7 @@ from rig.core.json_form import plain
 from sim.change import Change
 
 SETTINGS = (
-    *("enroll.views=4", "identify.max_views=2"),
+    *("enroll.views=6", "identify.max_views=2"),
     *("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]"),
 )
 SMALL = ("--count", "2", *(word for setting in SETTINGS for word in ("--set", setting)))
@@ -23,7 +23,7 @@ def demo(*arguments: str):
 
 def timeless(page: str) -> str:
     """Return the page without its date, and without its footer, which has the run time."""
-    cut, found = re.subn(r"<footer>.*?</footer>|<time>.*?</time>", "", page, flags=re.DOTALL)
+    cut, found = re.subn(r"<footer>.*?</footer>|<time[^>]*>.*?</time>", "", page, flags=re.DOTALL)
     assert found == 2
     return cut
 
@@ -31,13 +31,13 @@ def timeless(page: str) -> str:
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    return demo(*SMALL, "--seed", "3", "--out", str(out)), out
+    return demo(*SMALL, "--seed", "1", "--out", str(out)), out
 
 
 @pytest.fixture(scope="module")
 def in_json(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo-json")
-    return demo(*SMALL, "--seed", "3", "--json", "--out", str(out)), out
+    return demo(*SMALL, "--seed", "1", "--json", "--out", str(out)), out
 
 
 def test_demo_enrolls_and_finds_objects_and_recognises_unknown_ones(small):
@@ -52,7 +52,7 @@ def test_demo_enrolls_and_finds_objects_and_recognises_unknown_ones(small):
     for reached, asked in moves:
         assert float(reached) == pytest.approx(float(asked), abs=0.5)
     assert text.count("(not enrolled)") == 2
-    assert "2 objects enrolled with 8 views" in text
+    assert "2 objects enrolled with 12 views" in text
 
 
 def test_demo_leaves_only_the_report(small):
@@ -93,7 +93,7 @@ def test_ambiguous_answers_are_a_count_of_their_own(small, in_json):
 def test_json_names_the_change_of_the_bench(in_json, tmp_path):
     """With marks on the platter, in other light, and with clutter; they do not end the demo."""
     unchanged = json.loads(in_json[0].stdout)
-    done = demo(*SMALL, "--seed", "3", "--change", "hard", "--json", "--out", str(tmp_path))
+    done = demo(*SMALL, "--seed", "1", "--change", "hard", "--json", "--out", str(tmp_path))
     assert done.exit_code in (0, 6)
     assert "Error" not in done.output
     changed = json.loads(done.stdout)

@@ -165,7 +165,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path, m
     decision = StopDecision(hbr.Outcome.FOUND, hbr.StopReason.CONFIDENT, 0, 0.99, 0.004, 0.97)
     seen.add(check_event(Ranked(3, (Candidate("dice", 0.9, 30.0, 0.99),), 0.2, decision)))
     seen.add(check_event(ObjectChanged(3, 2, 7.5, 3.0)))
-    seen.add(check_event(Verified(3, "dice", 0.7, 0.4, 0.3, 0.8, hbr.Outcome.FOUND, 0.99, 0.004)))
+    seen.add(check_event(Verified(3, "dice", 0.7, 0.4, 0.3, 0.8, 0.02, hbr.Outcome.FOUND, 0.99, 0.004)))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == KINDS.keys()
 

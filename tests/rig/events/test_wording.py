@@ -134,7 +134,7 @@ def test_unknown_object_has_the_probability_that_it_is_not_enrolled() -> None:
 
 
 def test_verification_is_put_into_words() -> None:
-    found = Verified(3, "mug", 0.7, 0.4, 0.3, 0.8, Outcome.FOUND, 0.99, 0.005)
+    found = Verified(3, "mug", 0.7, 0.4, 0.3, 0.8, 0.02, Outcome.FOUND, 0.99, 0.005)
     words = (
         "its enrolled views explain 70.0 % of the contrast (of each other 80.0 %), those of the second candidate 40.0 %"
     )
