@@ -75,7 +75,7 @@ def write_page(
     template = environment("calibration", "rig.report", "rig.charts").get_template("report.html.j2")
     page = template.render(
         title=f"Calibration of {bench}",
-        date=f"{now_utc:%Y-%m-%d %H:%M} UTC",
+        date=now_utc.astimezone(),
         summary="The errors of the bench itself, with standard uncertainties (1 σ), expanded uncertainties "
         "U (k = 2, about 95 %), and their budgets by JCGM 100:2008. A source of type A is the scatter of the "
         "measurements, one of type B is known otherwise.",
