@@ -43,8 +43,7 @@ test: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs
 
 # This also selects the tests marked nightly. It leaves out the kernel tests and the installation on a Debian, which need
-# the whole computer. With so many
-# cases, one test may take minutes, so the limit that ends a test that hangs is longer.
+# the whole computer. With so many cases, one test may take minutes, so the limit that ends a test that hangs is longer.
 test-nightly: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel and not debian" --timeout 1800 --hypothesis-profile=nightly
 

@@ -2,8 +2,8 @@
 
 `python -m benchmarks.fit_search COIL-100 ETH-80 [--objects N] [--conditions NAME ...] [--keep-prior] [--out FOLDER]`
 
-The weights of the network must be installed. It takes about a quarter of an hour on two cores with ``--keep-prior``,
-which made the shipped ``evidence.json``. Objects 1-50 of COIL-100 and every second one of ETH-80 are searched for,
+The weights of the network must be installed. It takes less than an hour on two cores with ``--keep-prior``. The shipped
+``evidence.json`` was made so. Objects 1-50 of COIL-100 and every second one of ETH-80 are searched for,
 among all that a condition enrolls. There are two steps:
 
 - The prior: means, covariances and spreads of the enrolled views of objects 1-50 of COIL-100.

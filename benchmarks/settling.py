@@ -46,12 +46,16 @@ def settling_s(hz: float, damping: float, seed: int) -> dict[str, float]:
                 except MotionTimeout:
                     slowest[kind] = inf
                     break
-                rest_s = table.moves[-1].readings[-1][0] * 1e-9
-                times = np.arange(rest_s - 8.0, rest_s, 0.001)
-                speeds_dps = np.array([abs(world.shaft(round(time_s * 1e9))[1]) for time_s in times])
-                stop_s = float(times[speeds_dps > config.table.quiet_dps][-1])
-                slowest[kind] = max(slowest[kind], rest_s - stop_s)
+                slowest[kind] = max(slowest[kind], settled_s(table, world, config.table.quiet_dps))
     return slowest
+
+
+def settled_s(table: Turntable, world: World, quiet_dps: float) -> float:
+    """Return how long after its shaft was slower than ``quiet_dps`` the table counted as at rest, in the last move."""
+    rest_s = table.moves[-1].readings[-1][0] * 1e-9
+    times = np.arange(rest_s - 5.0, rest_s, 0.001)
+    speeds_dps = np.array([abs(world.shaft(round(time_s * 1e9))[1]) for time_s in times])
+    return rest_s - float(times[speeds_dps > quiet_dps][-1])
 
 
 def main() -> None:

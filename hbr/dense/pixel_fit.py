@@ -9,6 +9,7 @@ Decision: docs/decisions/0015.
 """
 
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Final, NamedTuple
 
 import cv2
@@ -36,7 +37,7 @@ _AREAS: Final = (0.55, 1.8)  # outside, the two boxes cannot be of one object, o
 #: Units of a logarithm, and grey levels that keep it finite.
 _UNITS: Final = 40.0
 _DARK: Final = (9.0, 12.0)  # larger: less noise of dark pixels, and less of their contrast
-#: Largest difference of the light that counts: a factor of e.
+#: Largest square of a difference of the light that counts: that of a factor of e.
 _MOST_LIGHT: Final = 1.0
 #: Smallest number of common pixels for a comparison.
 _FEWEST: Final = 60
@@ -92,6 +93,10 @@ class Compared(NamedTuple):
     """float64 array (3,): median differences of the three logarithms, that is, of the exposure and the light."""
 
 
+#: The key by which the best of several comparisons is found.
+BY_FIT: Final = attrgetter("fit")
+
+
 class PixelFit(NamedTuple):
     """The comparison of the leading candidates of a search with its views; a fit is at most 1."""
 
@@ -118,7 +123,7 @@ def compare(view: Pixels, enrolled: Pixels) -> Compared:
     begin = _begin(view, enrolled)
     found = _fit_map(view, enrolled, begin)
     moved = [_compare(view, enrolled, move) for move in ([begin] if found is None else [begin, found])]
-    return max(moved, key=lambda one: one.fit)
+    return max(moved, key=BY_FIT)
 
 
 def _compare(view: Pixels, enrolled: Pixels, move: Map) -> Compared:

@@ -12,7 +12,6 @@ Decisions: docs/decisions/0013, docs/decisions/0015, docs/decisions/0017.
 
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from operator import attrgetter
 from typing import ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -25,7 +24,7 @@ from hbr.dense.evidence import near_twins
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.next_view import NextBestView, next_best_view
-from hbr.dense.pixel_fit import Compared, LocalView, PixelFit, Pixels, compare
+from hbr.dense.pixel_fit import BY_FIT, Compared, LocalView, PixelFit, Pixels, compare
 from hbr.dense.pose import azimuth_of
 from hbr.dense.stopping import HOPELESS, Outcome, StopDecision, among_enrolled, decide, pair_odds
 
@@ -35,7 +34,6 @@ NEAREST: Final = 2  # a view lies between two enrolled ones; further ones show o
 _SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of every candidate
 #: Candidates that are compared with the views.
 _COMPARED: Final = 3  # the two leaders, and one more if these are near twins
-_BY_FIT: Final = attrgetter("fit")
 #: From this probability of "not enrolled" on, the next view is taken without a fit, which would hardly end the search.
 _NOT_WORTH_A_FIT: Final = 0.95
 
@@ -92,7 +90,7 @@ class Fits:
         self._seen: dict[int, list[Pixels]] = {}
         self._enrolled: dict[tuple[int, float], Pixels] = {}
         self._of_views: dict[tuple[int, int, float], Compared] = {}
-        self._of_pairs: dict[tuple[int, float, float], Compared] = {}
+        self._of_pairs: dict[tuple[int, float, float], float] = {}
 
     def views(
         self, object_index: int, own_deg: FloatArray, azimuths_deg: Sequence[float]
@@ -114,14 +112,14 @@ class Fits:
             if n not in self._seen:
                 self._seen[n] = [Pixels.of(one) for one in queries(n)[:_SEGMENTATIONS]]
             pixels = self._pixels(object_index, enrolled)
-            self._of_views[key] = max((compare(one, pixels) for one in self._seen[n]), key=_BY_FIT)
+            self._of_views[key] = max((compare(one, pixels) for one in self._seen[n]), key=BY_FIT)
         return self._of_views[key]
 
-    def of_pair(self, object_index: int, one: LocalView, other: LocalView) -> Compared:
-        """Compare two enrolled views of an object."""
+    def of_pair(self, object_index: int, one: LocalView, other: LocalView) -> float:
+        """Return the fit of two enrolled views of an object."""
         key = object_index, one.azimuth_deg, other.azimuth_deg
         if key not in self._of_pairs:
-            self._of_pairs[key] = compare(self._pixels(object_index, one), self._pixels(object_index, other))
+            self._of_pairs[key] = compare(self._pixels(object_index, one), self._pixels(object_index, other)).fit
         return self._of_pairs[key]
 
     def _pixels(self, object_index: int, view: LocalView) -> Pixels:
@@ -151,7 +149,7 @@ def verify(belief: Belief, queries: Queries, fits: Fits | None = None) -> Asking
         enrolled_deg = np.array([view.azimuth_deg for view in views])
         nearest = [[views[place] for place in _nearest(enrolled_deg, deg).tolist()] for deg in azimuths_deg]
         best = [
-            max((fits.of_view(n, queries, candidate, one) for one in near), key=_BY_FIT)
+            max((fits.of_view(n, queries, candidate, one) for one in near), key=BY_FIT)
             for n, near in enumerate(nearest)
         ]
         found.append(best)
@@ -162,15 +160,15 @@ def verify(belief: Belief, queries: Queries, fits: Fits | None = None) -> Asking
     is_other = ~near_twins(belief, int(places[leader]), places)
     others = [mean for mean, other in zip(means, is_other.tolist(), strict=True) if other]
     # what a view between two enrolled ones has at least
-    between = [fits.of_pair(candidates[leader], near[0], near[-1]) for near in beside[leader]]
+    expected = np.mean([fits.of_pair(candidates[leader], near[0], near[-1]) for near in beside[leader]])
     light = np.mean([one.light for one in found[leader]], axis=0)
     return PixelFit(
         candidates[leader],
         means[leader],
         means[1 - leader] if len(candidates) > 1 else 0.0,
         max(others, default=0.0),
-        expected=float(np.mean([one.fit for one in between])),
-        light=float(light @ light),
+        float(expected),
+        float(light @ light),
     )
 
 
