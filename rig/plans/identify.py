@@ -152,6 +152,8 @@ class ViewsAtRest:
             yield event
 
     def _enrolled(self, object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
+        # The comparison with all candidates takes some tenths of a second: a stop must not wait for its end.
+        self.bench.safety.check_stop_request()
         read, name = self.model.leader_views, self.search.names[object_index]
         try:
             return None if read is None else read(name, azimuths_deg)

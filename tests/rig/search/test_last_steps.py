@@ -2,9 +2,9 @@
 
 from argparse import Namespace
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
 from pathlib import Path
 
@@ -13,10 +13,11 @@ import pytest
 import hbr
 from benchmarks.twins import kind_of, searches
 from hbr.dense import stopping
-from hbr.dense.pixel_fit import PixelFit
+from hbr.dense.pixel_fit import LocalView, PixelFit
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import load_config
+from rig.core.errors import MotionStopped
 from rig.events.events import Identified, NoteCode, Verified, Warned
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
@@ -123,6 +124,22 @@ def test_a_search_decides_without_a_missing_image(
     assert not any(isinstance(event, Verified) for event in events)
     assert isinstance(events[-1], Identified)
     assert "vase-blue" in events[-1].possible
+
+
+def test_a_stop_does_not_wait_for_the_end_of_the_comparison(enrolled: tuple[Bench, Catalog]) -> None:
+    bench, catalog = enrolled
+    model = load_model(catalog)
+    read: list[str] = []
+
+    def stopped_meanwhile(name: str, azimuths_deg: Sequence[float]) -> Sequence[LocalView]:
+        read.append(name)
+        bench.state.request_stop()
+        assert model.leader_views is not None
+        return model.leader_views(name, azimuths_deg)
+
+    with pytest.raises(MotionStopped):
+        list(identify(bench, replace(model, leader_views=stopped_meanwhile)))
+    assert len(read) == 1  # not those of the second candidate
 
 
 @pytest.mark.nightly
