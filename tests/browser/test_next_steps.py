@@ -2,6 +2,8 @@
 
 import pytest
 
+from tests.browser.test_day import PHONE
+
 pytestmark = pytest.mark.nightly  # make test-web runs them
 
 
@@ -21,6 +23,9 @@ def test_fault_is_acknowledged_on_any_page(page, serve_process, stored, tmp_path
     page.wait_for_selector("#state:text-is('Fault 505')")
     page.wait_for_selector("#next-steps:has-text('The table is blocked'):has-text('Remove what blocks the table')")
     page.goto(f"{server.url}enroll")
+    page.set_viewport_size(PHONE)
+    page.wait_for_selector("#next-steps button:has-text('Acknowledge the fault')")
+    assert page.evaluate("document.querySelector('header').offsetHeight") <= 90  # a fault hides no more of the page
     page.click("#next-steps button:has-text('Acknowledge the fault')")
     page.wait_for_selector("#state:has-text('Ready')")
     assert page.text_content("#next-steps") == ""
