@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -59,6 +60,8 @@ CONDITIONS: Final = {
 _SMALL: Final = (1, 4)
 #: Directions of each covariance that the prior keeps; the rest is a variance for each entry.
 _DIRECTIONS: Final = 96
+#: Views of each search; the numbers of later views hardly differ, and take as long again.
+_VIEWS: Final = 4
 #: Hidden units of each network, and how many networks from different starts are averaged.
 _UNITS, _STARTS = 8, 3
 _SPREAD: Final = 0.3  # of the first weights
@@ -148,7 +151,7 @@ class _Searches:
         catalogs = {kind: list(_catalogs(views, item.name)) for kind, views in self._views.items()}
         for search in searches(item, self._experiment):
             azimuths_deg: list[float] = []
-            for seen, azimuth_deg in search.views:
+            for seen, azimuth_deg in islice(search.views, _VIEWS):
                 azimuths_deg.append(azimuth_deg)
 
                 def queries(n: int, seen: ViewsTogether = seen) -> list[LocalView]:

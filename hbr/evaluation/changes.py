@@ -1,8 +1,8 @@
 """Searches by image after a change of the bench: rates of right decisions and of accepted unknown objects.
 
 Objects are enrolled on one drawn bench. Each search is a visit to the same bench (mild change), or to one of twelve
-other benches (hard change), with four views, 90° apart. Every ninth object is never enrolled. Without a change, the
-photographs are used as they are, all objects are enrolled, and the views of searches are those that are not enrolled.
+other benches (hard change), with up to eight views: four 90° apart, and then those between them. Every ninth object is
+never enrolled. Without a change, the photographs are used as they are, all objects are enrolled, and the views of searches are those that are not enrolled.
 The drawn benches have texture and clutter, or all of them have one plain backdrop with a visible platter.
 """
 
@@ -32,9 +32,11 @@ from hbr.evaluation.statistics import bootstrap_mean
 from hbr.model.views import Views
 from hbr.segmentation import Background
 
-#: Largest number of views of a search, and the step between them.
-VIEWS: Final = 4
-_STEP_DEG: Final = 90.0
+#: Largest number of views of a search, as on the rig, and where they are relative to the first one.
+MAX_VIEWS: Final = 8
+_VIEWS_DEG: Final = np.array([0, 90, 180, 270, 45, 135, 225, 315], np.float64)
+#: Views whose leading object is recorded, even if the search has ended.
+_RANKED: Final = 4
 _BENCHES: Final = 12  # more: the result depends less on one drawing; each process draws them once
 _NEVER_ENROLLED: Final = 9  # every ninth object, so that rates of unknown objects have a number of cases, too
 #: Objects whose enrolled views each process remembers for the last steps of searches, 4 MB each with 36 views.
@@ -53,7 +55,6 @@ class SearchResult:
     leaders: tuple[str, ...]
     """After 1, 2, 3 and 4 views."""
     outcome: Outcome
-    """Outcome of the search within four views."""
     decided: str
     """The leading object at the end."""
     views: int
@@ -142,10 +143,12 @@ def search_changed(
     for views_so_far in searches(item, experiment):
         search = _Search(index, enrolled)
         without = None if left_out is None else _Search(left_out, enrolled)
+        both = [search] if without is None else [search, without]
         for views, azimuth_deg in views_so_far.views:
-            search.add(views, azimuth_deg, views_so_far.other_bench)
-            if without is not None:
-                without.add(views, azimuth_deg, views_so_far.other_bench)
+            for one in both:
+                one.add(views, azimuth_deg, views_so_far.other_bench)
+            if all(one.is_done for one in both):
+                break
         result = search.result()
         results.append(result if without is None else _with_left_out(result, without.result()))
     return results
@@ -172,7 +175,7 @@ def searches(item: PhotographedObject, experiment: Experiment) -> Iterator[Searc
     for trial in range(experiment.protocol.trials):
         rng = generator(experiment.protocol.seed, item.name, "trial", trial)
         scene = _search_scene(experiment, rng)
-        wanted_deg = rng.uniform(0, 360) + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)
+        wanted_deg = rng.uniform(0, 360) + _VIEWS_DEG
         empty = None if before is None else scene.empty()
         other_bench = before is not None and empty is not None and before.shows_another_bench(empty)
         yield SearchViews(_views_so_far(item, experiment, scene, empty, wanted_deg), other_bench)
@@ -205,17 +208,20 @@ class _Search:
     """A search that continues after its end, to record the leading object after each view."""
 
     def __init__(self, index: DenseIndex, enrolled: Callable[[str], EnrolledViews]) -> None:
-        self._session = DenseSession(index, max_views=VIEWS, most_changes=0)
+        self._session = DenseSession(index, max_views=MAX_VIEWS, most_changes=0)
         self._names = index.views.object_names
         self._enrolled = enrolled
         self._leaders: list[str] = []
         self._result: SearchResult | None = None
 
     def add(self, views: ViewsTogether, azimuth_deg: float, other_bench: bool) -> None:
+        if self.is_done:
+            return
         session = self._session
         *earlier, levels = views.levels
         session.add(levels, azimuth_deg, earlier=earlier, reliable=views.reliable, other_bench=other_bench)
-        self._leaders.append(self._names[int(session.belief.ranking().object_index[0])])
+        if len(self._leaders) < _RANKED:
+            self._leaders.append(self._names[int(session.belief.ranking().object_index[0])])
         if self._result is not None:
             return
         orientations_deg = session.belief.orientation_deg.tolist()
@@ -230,12 +236,16 @@ class _Search:
                 (),
                 end.outcome,
                 self._names[end.object_index],
-                len(self._leaders),
+                len(views.levels),
                 self._stated(end.object_index),
                 session.verification is not None,
                 end.probability,
                 end.not_enrolled,
             )
+
+    @property
+    def is_done(self) -> bool:
+        return self._result is not None and len(self._leaders) == _RANKED
 
     def _stated(self, leader: int) -> StatedPose:
         belief = self._session.belief
@@ -278,7 +288,7 @@ def summary(
     stated = [one.probability for _, one in found] + [one.left_out_probability for one in accepted]
     return {
         "searches": len(searches),
-        **{f"hit_rate_{n}": sum(one.leaders[n - 1] == name for name, one in searches) / count for n in (1, 2, VIEWS)},
+        **{f"hit_rate_{n}": sum(one.leaders[n - 1] == name for name, one in searches) / count for n in (1, 2, _RANKED)},
         "decided_right": sum(one.decided == name for name, one in found) / count,
         "decided_wrong": sum(one.decided != name for name, one in found) / count,
         "called_unknown": sum(one.outcome is Outcome.UNKNOWN for _, one in searches) / count,
@@ -372,9 +382,9 @@ def _query_places(item: PhotographedObject, experiment: Experiment, azimuth_deg:
     if experiment.change != "none":
         return nearest_photographs(item, azimuth_deg)
     others = np.flatnonzero(~views_enrolled(item.azimuth_deg, experiment.protocol.enrolled or 0))
-    if len(others) < VIEWS:
+    if len(others) < MAX_VIEWS:
         raise ValueError(
-            f"{item.name} has {len(others)} photographs that are not enrolled; a search needs {VIEWS}: enroll fewer"
+            f"{item.name} has {len(others)} photographs that are not enrolled; a search needs {MAX_VIEWS}: enroll fewer"
         )
     left = replace(item, photographs=tuple(item.photographs[place] for place in others))
     return [int(others[place]) for place in nearest_photographs(left, azimuth_deg)]

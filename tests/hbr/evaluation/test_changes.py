@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.evaluation.changes import SearchResult, intervals, is_enrolled, summary
+from hbr.evaluation.changes import MAX_VIEWS, SearchResult, intervals, is_enrolled, summary
 from hbr.evaluation.experiment import Experiment
 from hbr.evaluation.protocol import Protocol
+from rig.config import load_config
 
 
 def result(leader: str, outcome: hbr.Outcome, views: int = 1, left_out: hbr.Outcome | None = None) -> SearchResult:
@@ -57,6 +58,10 @@ def test_stated_probabilities_are_compared_with_the_shares_of_right_answers() ->
     assert found["left_out_not_enrolled"] == pytest.approx(0.51)
     nothing = summary(known | {"a": known["a"][2:]}, {})
     assert (nothing["accepted_stated"], nothing["left_out_not_enrolled"]) == (None, None)
+
+
+def test_a_search_takes_as_many_views_as_on_the_bench() -> None:
+    assert load_config(None).identify.max_views == MAX_VIEWS
 
 
 def test_every_ninth_object_is_never_enrolled() -> None:
