@@ -65,8 +65,10 @@ class Picamera2:
         if camera_num >= len(self.global_camera_info()):
             raise RuntimeError(f"No camera number {camera_num} found")
         if type(self).in_use:
-            busy = RuntimeError("Failed to acquire camera: Device or resource busy")
-            raise RuntimeError("Camera __init__ sequence did not complete.") from busy
+            try:
+                raise RuntimeError("Failed to acquire camera: Device or resource busy")
+            except RuntimeError as busy:
+                raise RuntimeError("Camera __init__ sequence did not complete.") from busy
         type(self).in_use = True
         self._webcam = camera_num > 0
         self._config: dict[str, Any] | None = None

@@ -111,7 +111,7 @@ class Picamera2Capture:
             raise DeviceNotFound(
                 f"The camera {number} of the Raspberry Pi cannot be opened.",
                 next_step="Close the program that uses it, for example rpicam-hello.",
-                evidence={"reason": str(error.__cause__ or error)},
+                evidence={"reason": str(error.__context__ or error)},
             ) from error
         self._modes = [mode for mode in self._camera.sensor_modes if "crop_limits" in mode]  # a USB camera has none
         self._size = (640, 480)
