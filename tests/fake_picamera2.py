@@ -3,10 +3,13 @@
 It has the part of picamera2's interface that `rig.devices.picamera2_capture` uses, with the behaviour that a driver can
 handle wrongly: settings take effect some frames later, only the metadata of a frame contain the settings in force, a
 name that the camera lacks is an error, there are only as many frames as released buffers, the time stamp is that of the
-readout, and most modes of the sensor see a part of its field only.
+readout, most modes of the sensor see a part of its field only, a camera's place in the list is not libcamera's number,
+and after a time without frames it must be stopped and started. The list ends with a USB webcam.
+`tests/kernel/test_picamera2.py` has the same behaviour from picamera2 itself.
 """
 
 from collections import deque
+from concurrent.futures import CancelledError
 from math import log10
 from types import ModuleType
 from typing import Any, Final
@@ -18,8 +21,9 @@ from numpy.typing import NDArray
 from rig.core.clock import Clock
 from sim.camera import SimCapture
 
-DELAY_FRAMES: Final = 4
-"""Frames until a setting is in force."""
+DELAY_FRAMES: Final = 7
+"""Frames until a setting is in force: as many as wait in buffers, and the delay of the sensor."""
+WEBCAM: Final = "HD Pro Webcam C920"
 _LONGEST_US: Final = 33_000
 _CONTROLS: Final[dict[str, tuple[Any, Any, Any]]] = {
     "AeEnable": (False, True, True),
@@ -58,17 +62,21 @@ class Picamera2:
     in_use = False
 
     def __init__(self, camera_num: int = 0) -> None:
-        if camera_num != 0:
-            raise IndexError("list index out of range")
+        if camera_num >= len(self.global_camera_info()):
+            raise RuntimeError(f"No camera number {camera_num} found")
         if type(self).in_use:
-            raise RuntimeError("Failed to acquire camera: Device or resource busy")
+            try:
+                raise RuntimeError("Failed to acquire camera: Device or resource busy")
+            except RuntimeError as busy:
+                raise RuntimeError("Camera __init__ sequence did not complete.") from busy
         type(self).in_use = True
+        self._webcam = camera_num > 0
         self._config: dict[str, Any] | None = None
-        self._started = self._closed = False
+        self._started = self._closed = self._given_up = False
         self._pending: deque[tuple[int, dict[str, Any]]] = deque()
+        self._jobs: list[Job] = []
         self._frames = 0
         self.held = 0
-        self._waiting = 0
         self.field = 1.0
         """Share of the sensor's width that the mode sees."""
         self.sensor.reopen()
@@ -76,16 +84,19 @@ class Picamera2:
     @classmethod
     def global_camera_info(cls) -> list[dict[str, Any]]:
         return [
-            {"Model": cls.model, "Location": 2, "Rotation": 180, "Id": f"/base/axi/pcie/i2c/{cls.model}@1a", "Num": 0}
+            {"Model": cls.model, "Location": 2, "Rotation": 180, "Id": f"/base/axi/pcie/i2c/{cls.model}@1a", "Num": 1},
+            {"Model": WEBCAM, "Location": 2, "Id": "/base/axi/pcie/usb-1:1.0-046d:082d", "Num": 0},
         ]
 
     @property
     def camera_controls(self) -> dict[str, tuple[Any, Any, Any]]:
-        return dict(_CONTROLS)
+        return {} if self._closed else {"ExposureTime": (100, 33_300, 10_000)} if self._webcam else dict(_CONTROLS)
 
     @property
     def sensor_modes(self) -> list[dict[str, Any]]:
         assert not self._started  # it configures the camera in each mode
+        if self._webcam:
+            return [{"format": "MJPEG"}]
         return [
             {"format": f"SRGGB{bits}", "bit_depth": bits, "size": size, "fps": fps, "crop_limits": crop}
             for bits in (10, 8)
@@ -99,7 +110,10 @@ class Picamera2:
         buffer_count: int = 6,
         sensor: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
-        return {"main": {"format": "XBGR8888", "size": (1280, 720)} | (main or {})} | {
+        asked = {"format": "XBGR8888", "size": (1280, 720)} | (main or {})
+        asked["size"] = tuple(pixels - pixels % 2 for pixels in asked["size"])
+        return {
+            "main": asked,
             "sensor": sensor or {},
             "controls": controls or {},
             "buffer_count": buffer_count,
@@ -124,7 +138,8 @@ class Picamera2:
 
         _, _, (_, _, seen, _) = min(MODES[self.model], key=distance)
         self.field = seen / MODES[self.model][-1][0][0]
-        self._config = config | {"main": config["main"] | {"size": size}}
+        pixel_format = "MJPEG" if self._webcam else "RGB888"
+        self._config = config | {"main": config["main"] | {"size": size, "format": pixel_format}}
 
     def camera_configuration(self) -> dict[str, Any]:
         assert self._config is not None
@@ -133,7 +148,7 @@ class Picamera2:
     def start(self) -> None:
         if self._config is None:
             raise RuntimeError("Camera has not been configured")
-        self._started = True
+        self._started, self._given_up = True, False
         self._pending.clear()
         self._apply(self._config["controls"])
 
@@ -149,31 +164,36 @@ class Picamera2:
         self._check(controls)
         self._pending.append((self._frames + DELAY_FRAMES, dict(controls)))
 
-    def capture_request(self, wait: bool | float | None = None) -> "CompletedRequest":
-        if not self._started:
-            raise RuntimeError("Camera is not started")
-        assert self._config is not None
-        timeout_s = float(wait or 0)
-        if self.held >= self._config["buffer_count"]:  # no buffer is free: the camera waits
-            self.clock.sleep(timeout_s)
-            raise TimeoutError
-        while self._pending and self._pending[0][0] <= self._frames:
-            self._apply(self._pending.popleft()[1])
-        if self.sensor.hangs or not self.sensor.grab():
-            self.clock.sleep(timeout_s)
-            self._waiting += 1  # the job is not cancelled by its timeout
-            raise TimeoutError
-        self.held, self._waiting = self.held + self._waiting, 0  # the jobs before it take their frames
-        self._frames += 1
-        return CompletedRequest(self)
+    def capture_request(self, wait: bool | float | None = None) -> "CompletedRequest | Job":
+        """Return the next frame within the seconds to wait; without these, a job that takes it."""
+        self._jobs.append(job := Job(self))
+        return job.get_result(wait) if wait else job
 
     def cancel_all_and_flush(self) -> None:
         """Cancel the jobs that wait for a frame."""
-        self._waiting = 0
+        for job in self._jobs:
+            job.cancelled = True
+        self._jobs.clear()
+
+    def complete(self, last: "Job", timeout_s: float) -> "CompletedRequest":
+        """Let the jobs take their frames in turn up to the last one, and return its frame."""
+        if self.sensor.hangs:  # libcamera gives the sensor up
+            self._given_up = True
+        while last in self._jobs:
+            free = self._config is not None and self.held < self._config["buffer_count"]
+            if not (self._started and free) or self._given_up or not self.sensor.grab():
+                self.clock.sleep(timeout_s)
+                raise TimeoutError
+            while self._pending and self._pending[0][0] <= self._frames:
+                self._apply(self._pending.popleft()[1])
+            self._frames += 1
+            self._jobs.pop(0).frame = CompletedRequest(self)
+        assert last.frame is not None
+        return last.frame
 
     def _check(self, controls: dict[str, Any]) -> None:
         for name in controls:
-            if name not in _CONTROLS:
+            if name not in self.camera_controls:
                 raise RuntimeError(f"Control {name} is not advertised by libcamera")
 
     def _apply(self, controls: dict[str, Any]) -> None:
@@ -195,12 +215,27 @@ class Picamera2:
             sensor.set(cv2.CAP_PROP_FOCUS, round(controls["LensPosition"] * _FOCUS_PER_DIOPTRE))
 
 
+class Job:
+    """A request that waits for a frame. It keeps waiting after its time-out, until it is cancelled."""
+
+    def __init__(self, camera: Picamera2) -> None:
+        self._camera = camera
+        self.frame: CompletedRequest | None = None
+        self.cancelled = False
+
+    def get_result(self, timeout: float) -> "CompletedRequest":
+        if self.cancelled:
+            raise CancelledError
+        return self.frame or self._camera.complete(self, timeout)
+
+
 class CompletedRequest:
     """A frame in its buffer, until it is released."""
 
     def __init__(self, camera: Picamera2) -> None:
         sensor = camera.sensor
         self._camera = camera
+        self._released = False
         camera.held += 1
         exposure_us = int(sensor.get(cv2.CAP_PROP_EXPOSURE) * 100) - 8  # whole lines of the sensor
         begun_ns = round(sensor.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
@@ -217,6 +252,7 @@ class CompletedRequest:
 
     def make_array(self, name: str) -> NDArray[np.uint8]:
         assert name == "main"
+        assert not self._released
         _, image = self._camera.sensor.retrieve()
         assert image is not None
         lost = [round(pixels * (1 - self._camera.field) / 2) for pixels in image.shape[:2]]
@@ -224,6 +260,9 @@ class CompletedRequest:
         return np.asarray(cv2.resize(seen, image.shape[1::-1]), np.uint8)
 
     def release(self) -> None:
+        if self._released:
+            raise RuntimeError("CompletedRequest: lock now has negative ref_count")
+        self._released = True
         self._camera.held -= 1
 
 

@@ -11,6 +11,8 @@ import importlib
 import re
 import sys
 from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError
+from contextlib import suppress
 from math import log10, prod
 from typing import Any, Final
 
@@ -31,6 +33,7 @@ REPAIR: Final = (
     "that does not help: `sudo apt install --reinstall -y python3-picamera2 python3-libcamera python3-simplejpeg`."
 )
 _SOURCE: Final = re.compile(r"picamera2(?::(\d+))?")
+_FORMAT: Final = "RGB888"  # libcamera's name for the order B, G, R
 _FRAME_WAIT_S: Final = 3.0  # longer: an unplugged camera is noticed late; shorter: a long exposure looks like one
 _SETTLE_FRAMES: Final = 12
 """Frames after which changed settings are certainly in force: sensor and image processor delay them by several."""
@@ -57,7 +60,7 @@ def camera_id(number: int) -> str | None:
         cameras = import_picamera2().Picamera2.global_camera_info()
     except DeviceNotFound:
         return None
-    return next((f"{one['Model']} at {one['Id']}" for one in cameras if one.get("Num") == number), None)
+    return f"{cameras[number]['Model']} at {cameras[number]['Id']}" if number < len(cameras) else None
 
 
 def import_picamera2() -> Any:
@@ -85,16 +88,17 @@ class Picamera2Capture:
     in decibels (20 log10 of libcamera's AnalogueGain), focus in dioptres (LensPosition), sharpness as libcamera's.
     `get` returns the value in the metadata of a frame, -1 for a setting that the camera lacks.
 
-    ``number`` is that of `rpicam-hello --list-cameras`.
+    ``number`` is that of `rpicam-hello --list-cameras`: the place in the list, which is not libcamera's own number
+    ("Num").
 
     Raises `DeviceNotFound`: picamera2 is not installed or cannot be imported, there is no such camera, or another
-    program uses it.
+    program uses it. `grab` and `wait` raise it if the camera cannot be started, or is not one of a Raspberry Pi.
     """
 
     def __init__(self, number: int) -> None:
         library = import_picamera2()
         cameras = library.Picamera2.global_camera_info()
-        if not any(one.get("Num") == number for one in cameras):
+        if number >= len(cameras):
             raise DeviceNotFound(
                 f"libcamera finds no camera {number}.",
                 next_step="Switch the computer off and check the ribbon cable; `rpicam-hello --list-cameras` lists the "
@@ -103,11 +107,11 @@ class Picamera2Capture:
             )
         try:
             self._camera = library.Picamera2(number)
-        except (RuntimeError, IndexError) as error:
+        except RuntimeError as error:
             raise DeviceNotFound(
                 f"The camera {number} of the Raspberry Pi cannot be opened.",
                 next_step="Close the program that uses it, for example rpicam-hello.",
-                evidence={"reason": str(error)},
+                evidence={"reason": str(error.__context__ or error)},
             ) from error
         self._modes = [mode for mode in self._camera.sensor_modes if "crop_limits" in mode]  # a USB camera has none
         self._size = (640, 480)
@@ -119,6 +123,8 @@ class Picamera2Capture:
         self._request: Any = None
         self._metadata: Mapping[str, Any] = {}
         self._open, self._running, self._settling = True, False, False
+        self._silent_s = 0.0
+        """How long there has been no frame."""
         self._waiting = False
         """Whether `wait` has taken a frame that `grab` has not returned yet."""
 
@@ -147,12 +153,18 @@ class Picamera2Capture:
         """Take the next frame in place of the last one; there is no frame if none arrives in time."""
         self._start()
         self._release_request()
-        try:
-            self._request = self._camera.capture_request(wait=seconds)
-        except (TimeoutError, RuntimeError):  # the sensor hangs, or the camera stopped
-            self._camera.cancel_all_and_flush()  # or the request would later take a buffer that is never given back
-            return
-        self._metadata = self._request.get_metadata()
+        job = self._camera.capture_request(wait=False)
+        with suppress(TimeoutError, CancelledError):
+            try:
+                self._request = job.get_result(timeout=seconds)
+            except TimeoutError:
+                self._camera.cancel_all_and_flush()  # or it would later take a buffer that is never given back
+                self._request = job.get_result(timeout=_FRAME_WAIT_S)  # it may have taken one at the last moment
+        self._silent_s = 0.0 if self._request is not None else self._silent_s + seconds
+        if self._request is not None:
+            self._metadata = self._request.get_metadata()
+        elif self._silent_s >= _FRAME_WAIT_S:  # libcamera gives a silent sensor up, until the camera starts again
+            self._stop()
 
     def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
         """Return the frame that was grabbed last, uint8 (H, W, 3) BGR."""
@@ -164,9 +176,7 @@ class Picamera2Capture:
         """Stop the camera and close it; a second call does nothing."""
         if self._open:
             self._open = False
-            self._release_request()
-            if self._running:
-                self._camera.stop()
+            self._stop()
             self._camera.close()
 
     def get(self, propId: int, /) -> float:
@@ -179,11 +189,11 @@ class Picamera2Capture:
                 return min(self._fps, float(self._mode.get("fps", self._fps)))
             case cv2.CAP_PROP_POS_MSEC:
                 return self._exposed_ms()
-            case v4l2.EXPOSURE_DYNAMIC_FRAMERATE:
+            case v4l2.EXPOSURE_DYNAMIC_FRAMERATE if "FrameDurationLimits" in self._controls:
                 return float(not self._fixed_rate)
-            case cv2.CAP_PROP_AUTO_EXPOSURE:
+            case cv2.CAP_PROP_AUTO_EXPOSURE if "AeEnable" in self._controls:
                 return 3.0 if self._asked.get("AeEnable", True) else 1.0
-            case cv2.CAP_PROP_AUTO_WB:
+            case cv2.CAP_PROP_AUTO_WB if "AwbEnable" in self._controls:
                 return float(self._asked.get("AwbEnable", True))
             case cv2.CAP_PROP_AUTOFOCUS if "AfMode" in self._controls:
                 return float(self._asked.get("AfMode", _MANUAL_FOCUS) != _MANUAL_FOCUS)
@@ -196,7 +206,9 @@ class Picamera2Capture:
 
     def limits(self, propId: int) -> tuple[float, float] | None:
         """Return the smallest gain; see `V4l2Capture.limits`."""
-        return (round(20 * log10(self._controls["AnalogueGain"][0]), 1), 0.1) if propId == cv2.CAP_PROP_GAIN else None
+        if propId != cv2.CAP_PROP_GAIN or "AnalogueGain" not in self._controls:
+            return None
+        return round(20 * log10(self._controls["AnalogueGain"][0]), 1), 0.1
 
     def set(self, propId: int, value: float, /) -> bool:
         match propId:
@@ -257,10 +269,7 @@ class Picamera2Capture:
     def _resize(self, width: int, height: int) -> bool:
         if (width, height) != self._size:
             self._size = (width, height)
-            if self._running:
-                self._release_request()
-                self._camera.stop()
-                self._running = False
+            self._stop()
         return True
 
     @property
@@ -279,20 +288,43 @@ class Picamera2Capture:
         return min(self._modes, key=rank, default={})
 
     def _start(self) -> None:
-        """Start the camera with all requested settings. "RGB888" is libcamera's name for the order B, G, R."""
+        """Start the camera with all requested settings."""
         if self._running:
             return
         mode = self._mode
         config = self._camera.create_video_configuration(
-            main={"size": self._size, "format": "RGB888"},
+            main={"size": self._size, "format": _FORMAT},
             sensor={"output_size": mode["size"], "bit_depth": mode["bit_depth"]} if mode else {},
             controls=dict(self._asked),
             buffer_count=4,
         )
-        self._camera.configure(config)
-        self._size = tuple(self._camera.camera_configuration()["main"]["size"])  # libcamera may align it
-        self._camera.start()
+        try:
+            self._camera.configure(config)
+            main = self._camera.camera_configuration()["main"]
+            if main["format"] == _FORMAT:
+                self._camera.start()
+        except (RuntimeError, OSError) as error:
+            raise DeviceNotFound(
+                "The camera of the Raspberry Pi cannot be started.",
+                next_step="Check its cable. If the reason is memory, set a smaller camera.width and camera.height.",
+                evidence={"reason": str(error)},
+            ) from error
+        if main["format"] != _FORMAT:
+            raise DeviceNotFound(
+                f"libcamera delivers {main['format']} images of this camera, so it is not on a ribbon cable.",
+                next_step="Open a USB camera by its device file: `rig find` lists them.",
+                evidence={"format": main["format"]},
+            )
+        self._size = tuple(main["size"])  # libcamera may align it
         self._running = self._settling = True
+
+    def _stop(self) -> None:
+        """Stop the camera if it runs; `_start` starts it again."""
+        self._release_request()
+        if self._running:
+            self._running, self._silent_s = False, 0.0
+            with suppress(RuntimeError, OSError):  # it is gone
+                self._camera.stop()
 
     def _release_request(self) -> None:
         """Give the buffer of the last frame back; without free buffers the camera stops."""

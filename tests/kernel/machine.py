@@ -21,7 +21,7 @@ from rig.core.clock import SystemClock
 KERNEL: Final = "RIG_TEST_KERNEL"
 """The variable that names the kernel: a package (.deb), or a folder with ``boot`` and ``lib/modules``.
 
-A folder with Python, too, has all files of the machine, for example those of an arm64 computer (``guest/arm64.sh``).
+A folder with Python, too, has all files of the machine, for example those of an arm64 computer (``guest/computer.sh``).
 """
 ACCELERATOR: Final = "RIG_TEST_ACCELERATOR"
 """The variable that chooses QEMU's accelerator, for example ``kvm``; default: emulation, which works everywhere."""

@@ -20,7 +20,8 @@ UNCOMPRESSED, MJPEG, FRAME_BASED = 4, 6, 0x10
 _CAMERA_TERMINAL = b"\x01\x02"
 _DEFAULT_INTERVAL: Final = {UNCOMPRESSED + 1: 21, MJPEG + 1: 21, FRAME_BASED + 1: 17}
 """Where the descriptor of a frame has the default time between two frames; the list of all begins at byte 26."""
-_V4L2_NAMES: Final = {"YUY2": "YUYV", "H265": "HEVC"}
+_V4L2_NAMES: Final = {b"YUY2": "YUYV", b"H265": "HEVC", b"\x7d\xeb\x36\xe4": "BGR3"}
+"""Names by the first bytes of the GUID; the others are these bytes."""
 
 
 class Mode(NamedTuple):
@@ -82,8 +83,7 @@ class Video:
                 case 0x24, (14, 1), 5:
                     video.processing = part[3], int.from_bytes(part[8 : 8 + part[7]], "little")
                 case 0x24, (14, 2), 4 | 0x10:
-                    form, fourcc = part[3], part[5:9].decode()
-                    fourcc = _V4L2_NAMES.get(fourcc, fourcc)
+                    form, fourcc = part[3], _V4L2_NAMES.get(part[5:9]) or part[5:9].decode()
                 case 0x24, (14, 2), 6:
                     form, fourcc = part[3], "MJPG"
                 case 0x24, (14, 2), 5 | 7 | 0x11 as frame:

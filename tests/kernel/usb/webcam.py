@@ -69,7 +69,7 @@ class Setting(IntEnum):
 class Format(IntEnum):
     """Formats of the images, by their index in the descriptors."""
 
-    YUYV = 1
+    RAW = 1
     MJPG = 2
 
 
@@ -148,18 +148,25 @@ _CAMERA_BITS, _PROCESSING_BITS = 0b10_0000_0000_0010_1110, 0b1_0111_0101_0000
 SIZES: Final = ((WIDTH, HEIGHT), (WIDTH // 2, HEIGHT // 2))
 """Width and height of each mode, by the index of its descriptor minus one."""
 _INTERVALS = (10_000_000 // FPS, 20_000_000 // FPS, 10_000_000 // 5)
-_YUYV_GUID = bytes.fromhex("5955593200001000800000aa00389b71")
+_UNCOMPRESSED: Final = {
+    "YUYV": (bytes.fromhex("5955593200001000800000aa00389b71"), 16),
+    "BGR3": (bytes.fromhex("7deb36e44f52ce119f530020af0ba770"), 24),
+}
+"""GUID of a format, and its bits in a pixel."""
 
 
-def video_configuration() -> bytes:
-    """Return the configuration: a camera, its processing unit, and a stream in two formats and two sizes."""
+def video_configuration(uncompressed: str = "YUYV") -> bytes:
+    """Return the configuration: a camera, its processing unit, and a stream in two formats and two sizes.
+
+    One of the formats is MJPG, the other ``uncompressed``: YUYV or BGR3.
+    """
     return configuration(
         [
             struct.pack("8B", 8, 11, 0, 2, VIDEO, 3, 0, 0),  # both interfaces belong together
             interface(0, (VIDEO, CONTROL, 0)),
             *_units(),
             interface(1, (VIDEO, STREAM, 0), 1),
-            *_formats(),
+            *_formats(uncompressed),
             endpoint(0x80 | ENDPOINT, BULK, 512),
         ],
         interfaces=2,
@@ -179,16 +186,13 @@ def _units() -> list[bytes]:
     return [struct.pack("<3BHHI2B", 13, CLASS_INTERFACE, HEADER, 0x0100, total, CLOCK_HZ, 1, 1), *units]
 
 
-def _formats() -> list[bytes]:
+def _formats(uncompressed: str) -> list[bytes]:
     colours = bytes([6, CLASS_INTERFACE, 0x0D, 1, 1, 4])
     sizes = len(SIZES)
-    yuyv = (
-        struct.pack("5B", 27, CLASS_INTERFACE, UNCOMPRESSED, Format.YUYV, sizes)
-        + _YUYV_GUID
-        + bytes([16, 1, 0, 0, 0, 0])
-    )
+    guid, bits = _UNCOMPRESSED[uncompressed]
+    raw = struct.pack("5B", 27, CLASS_INTERFACE, UNCOMPRESSED, Format.RAW, sizes) + guid + bytes([bits, 1, 0, 0, 0, 0])
     mjpg = bytes([11, CLASS_INTERFACE, MJPEG, Format.MJPG, sizes, 1, 1, 0, 0, 0, 0])
-    parts = [yuyv, *_frames(UNCOMPRESSED + 1), colours, mjpg, *_frames(MJPEG + 1), colours]
+    parts = [raw, *_frames(UNCOMPRESSED + 1), colours, mjpg, *_frames(MJPEG + 1), colours]
     total = 15 + sum(map(len, parts))
     header = struct.pack(
         "<4BHBBBBBBBBB", 15, CLASS_INTERFACE, HEADER, 2, total, 0x80 | ENDPOINT, 0, _OUTPUT, 0, 0, 0, 1, 0, 0
@@ -215,7 +219,7 @@ C920: Final = Identity(0x046D, 0x082D, 0x0011, "", "HD Pro Webcam C920", "8E2A9F
 class Webcam(UsbDevice):
     """A webcam that sees what a simulated camera sees, in real time.
 
-    It streams YUYV and MJPG. In a mode with another pixel format, which OpenCV does not convert, no image comes.
+    It streams YUYV, BGR3 and MJPG. In a mode with another pixel format, which OpenCV does not convert, no image comes.
     ``stopped`` holds the stream in the middle of an image, as a camera does that has crashed.
 
     Parameters
@@ -420,13 +424,15 @@ class Webcam(UsbDevice):
         self.frames_sent += position >= len(data)
 
 
-STREAMED: Final = ("YUYV", "MJPG")
+STREAMED: Final = ("YUYV", "BGR3", "MJPG")
 
 
 def encoded(image: NDArray[np.uint8], fourcc: str) -> bytes:
     """Return an image, uint8 (height, width, 3), in the format of the stream."""
     if fourcc == "MJPG":
         return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
+    if fourcc == "BGR3":
+        return image.tobytes()
     # In YUYV levels reach from 16 to 235 (ITU-R BT.601), in JPEG from 0 to 255.
     return bytes(np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_YUYV)))
 

@@ -11,6 +11,7 @@ from rig.bench.computer import Computer
 from rig.bench.hardware import camera_settings
 from rig.config import CameraConfig, load_config
 from rig.core.errors import DeviceNotFound, DeviceSilent
+from rig.devices import v4l2
 from rig.devices.opencv_camera import OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from rig.devices.picamera2_capture import Picamera2Capture, camera_number
@@ -124,16 +125,60 @@ def test_hanging_sensor_is_silent_in_bounded_time(world, sensor):
     assert camera.capture(world.clock.now_ns()).exposed_ns > begun_ns
 
 
+def test_frame_that_arrives_at_the_time_out_is_not_lost(sensor, monkeypatch):
+    """Its buffer would never be given back."""
+    capture = open_capture("picamera2")
+    assert capture.wait(0)
+    assert capture.grab()
+    fake = type(capture._camera)
+
+    def cancelled(camera):
+        sensor.hangs = camera._given_up = False
+        camera.complete(camera._jobs[-1], 0.0)
+
+    monkeypatch.setattr(fake, "cancel_all_and_flush", cancelled)
+    for _ in range(2 * capture._camera.camera_configuration()["buffer_count"]):
+        sensor.hangs = True
+        assert capture.wait(0.1)
+        assert capture.grab()
+    assert capture._camera.held == 1
+
+
+def test_usb_camera_of_libcamera_is_rejected(sensor):
+    """Its images are JPEG, or have another order of colours; OpenCV opens it by its device file."""
+    capture = open_capture("picamera2:1")
+    lacking = (cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_AUTO_WB, v4l2.EXPOSURE_DYNAMIC_FRAMERATE, cv2.CAP_PROP_GAIN)
+    assert [capture.get(prop) for prop in lacking] == [-1] * 4
+    assert capture.limits(cv2.CAP_PROP_GAIN) is None
+    with pytest.raises(DeviceNotFound, match="delivers MJPEG images") as rejected:
+        capture.grab()
+    assert "device file" in rejected.value.next_step
+    capture.release()
+
+
+def test_camera_that_does_not_start_has_a_reason(sensor, monkeypatch):
+    def start(_):
+        raise OSError(12, "Cannot allocate memory")
+
+    capture = open_capture("picamera2")
+    monkeypatch.setattr(type(capture._camera), "start", start)
+    with pytest.raises(DeviceNotFound, match="cannot be started") as failed:
+        capture.grab()
+    assert "Cannot allocate memory" in failed.value.evidence["reason"]
+    capture.release()
+
+
 def test_missing_camera_other_user_and_missing_package_have_a_next_step(sensor, monkeypatch):
-    with pytest.raises(DeviceNotFound, match="no camera 1") as missing:
-        open_capture("picamera2:1")
-    assert missing.value.evidence == {"found": ["imx708"]}
+    with pytest.raises(DeviceNotFound, match="no camera 2") as missing:
+        open_capture("picamera2:2")
+    assert missing.value.evidence == {"found": ["imx708", picamera2.WEBCAM]}
     first = open_capture("picamera2")
-    with pytest.raises(DeviceNotFound, match="cannot be opened"):
+    with pytest.raises(DeviceNotFound, match="cannot be opened") as used:
         open_capture("picamera2")
+    assert used.value.evidence == {"reason": "Failed to acquire camera: Device or resource busy"}
     first.release()
     assert Computer().camera_device("picamera2:0") == "imx708 at /base/axi/pcie/i2c/imx708@1a"
-    assert Computer().camera_device("picamera2:1") is None
+    assert Computer().camera_device("picamera2:2") is None
     monkeypatch.setitem(sys.modules, "picamera2", None)
     with pytest.raises(DeviceNotFound, match="needs picamera2") as missing:
         Picamera2Capture(0)
