@@ -1,9 +1,10 @@
 """Searches by image after a change of the bench: rates of right decisions and of accepted unknown objects.
 
 Objects are enrolled on one drawn bench. Each search is a visit to the same bench (mild change), or to one of twelve
-other benches (hard change), with up to eight views: four 90° apart, and then those between them. Every ninth object is
-never enrolled. Without a change, the photographs are used as they are, all objects are enrolled, and the views of searches are those that are not enrolled.
-The drawn benches have texture and clutter, or all of them have one plain backdrop with a visible platter.
+other benches (hard change). It takes up to eight views: four that are 90° apart, and then those between them. Every
+ninth object is never enrolled. Without a change, the photographs are used as they are, all objects are enrolled, and
+the views of searches are those that are not enrolled. The drawn benches have texture and clutter, or all of them have
+one plain backdrop with a visible platter.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
