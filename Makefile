@@ -67,7 +67,8 @@ kernel-test: $(READY) $(LIBRARY)
 	    "The virtual machine needs: sudo apt-get install --no-install-recommends qemu-system-x86 busybox-static kmod udev"
 	@$(BIN)/python -m pytest -rs -m kernel -o faulthandler_timeout=300 tests/kernel
 
-# This needs root and Debian's debootstrap and systemd-container. It makes a Debian in RIG_TEST_DEBIAN, once.
+# This needs root and Debian's mmdebstrap and systemd-container. It makes a Debian in RIG_TEST_DEBIAN, once. For the one of a
+# Raspberry Pi (RIG_TEST_MACHINE=aarch64) see docs/how-to/raspberry-pi.md.
 debian-test: wheel
 	@$(BIN)/python -m pytest -rs -m debian tests/deploy
 

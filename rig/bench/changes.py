@@ -24,7 +24,7 @@ def set_key(target: Path, key: str, value: str, overrides: Iterable[str] = ()) -
         mistakes = [mistake.removeprefix("--set: ") for mistake in error.evidence.get("mistakes", ())]
         raise ConfigError(
             f"{target} is unchanged: it would have mistakes.",
-            next_step=("Give another value. For the keys and their values,", Do.SHOW_CONFIGURATION()),
+            next_step=("Give another value. To choose one,", Do.SHOW_CONFIGURATION()),
             evidence={"mistakes": mistakes} if mistakes else error.evidence,
         ) from error
     new = with_values(old, {tuple(key.split(".")): parsed(value)})

@@ -86,7 +86,7 @@ def _usage_error(*, json: bool) -> Iterator[None]:
     try:
         yield
     except _TYPER_USAGE_ERROR as error:
-        error.message = neutral(error.message)
+        error.message = neutral(error.message.removeprefix("Value error, "))  # Pydantic's words
         if json and type(error).__name__ != "NoArgsIsHelpError":
             path = error.ctx.command_path if error.ctx else "rig"
             problem = UsageError(error.format_message(), next_step=f"For the arguments: {path} --help")

@@ -71,7 +71,7 @@ class Do(StrEnum):
     # the configuration and the computer
     SET_KEY = "set-key", "set {key} to {value}", "rig config set {key} {value}"
     CHECK_CONFIGURATION = "check-configuration", "check the configuration", "rig config check"
-    SHOW_CONFIGURATION = "show-configuration", "list the keys of the configuration", "rig config show"
+    SHOW_CONFIGURATION = "show-configuration", "list the keys and their values", "rig config show"
     FREE_DISK = "free-disk", "free some space on the disk"
     INSTALL_EXTRA = "install-extra", "install the missing packages", "pip install 'hbr-rig[{extra}]'"
     NEW_TOKEN = "new-token", "make a token", "rig serve --new-token {name}"
@@ -165,6 +165,15 @@ def as_steps(given: SomeSteps) -> NextSteps:
     if isinstance(given, str | NextStep):
         given = (given,)
     return tuple(masked(step) for step in given if step)
+
+
+def for_bench(steps: SomeSteps, options: Iterable[str]) -> NextSteps:
+    """Return a next step whose commands have the options that select the bench, unless they name one themselves."""
+    given = tuple(options)
+    return tuple(
+        step if isinstance(step, str) or "bench" in step.parameters else step.with_options(given)
+        for step in as_steps(steps)
+    )
 
 
 def in_words(steps: SomeSteps) -> str:

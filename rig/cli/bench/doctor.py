@@ -174,7 +174,7 @@ def doctor_context(settings: Settings, *, default: bool = False) -> "Iterator[Do
 
     config = RigConfig() if default else settings.load()
     file_options = ("--config", str(settings.config)) if settings.config else ()
-    options = (*(("--bench", settings.bench) if settings.bench else ()), *file_options)
+    options = tuple(settings.selection())
     options += tuple(part for override in settings.overrides for part in ("--set", override))
     name = settings.bench or config.default_bench
     with open_context(name, config, seed=settings.seed, options=options, file_options=file_options) as context:

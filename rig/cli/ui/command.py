@@ -20,6 +20,7 @@ from rig.cli.ui.options import CommonOptions, options_of, show_parameters, sprea
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import discard, guarded_output
 from rig.core.errors import OutputFailed, RigError, UsageError
+from rig.core.next_steps import for_bench, in_words
 from rig.core.signals import EXIT_BY_SIGNAL, handle_signals
 
 
@@ -86,7 +87,7 @@ def without_color() -> None:
 
 
 def show_error(error: RigError, settings: Settings) -> None:
-    """Print an error with its evidence and its next step, without a traceback."""
+    """Print an error with its evidence and its next step, with commands for the same bench, without a traceback."""
     if settings.json:
         with suppress(OutputFailed):
             settings.print_json(error.problem)
@@ -98,4 +99,5 @@ def show_error(error: RigError, settings: Settings) -> None:
             lines.append(f"  {key}: {value}")
     lines += [f"  {note}" for note in getattr(error, "__notes__", ())]
     with suppress(OutputFailed):
-        print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
+        step = in_words(for_bench(error.steps, settings.selection()))
+        print("\n".join([*lines, f"Next step: {step}"]), file=sys.stderr)

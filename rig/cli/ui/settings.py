@@ -57,10 +57,14 @@ class Settings:
 
         return load_config(self.config, self.overrides, search=self.search)
 
+    def selection(self) -> list[str]:
+        """Return the arguments that select the same bench and configuration file for another command."""
+        words = [] if self.bench is None else ["--bench", self.bench]
+        return words if self.config is None else [*words, "--config", str(self.config)]
+
     def arguments(self) -> list[str]:
         """Return the arguments that pass these settings to another command, to be shown: without passwords."""
-        words = [] if self.bench is None else ["--bench", self.bench]
-        words += [] if self.config is None else ["--config", str(self.config)]
+        words = self.selection()
         words += [word for override in self.overrides for word in ("--set", masked(override))]
         words += [] if self.seed is None else ["--seed", str(self.seed)]
         return [*words, "--json"] if self.json else words

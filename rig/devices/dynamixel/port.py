@@ -77,17 +77,18 @@ def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None
 
 def _not_opened(path: str, baud: int, device: str, error: Exception, *, guarded: bool) -> DeviceNotFound:
     step: SomeSteps
-    reason = getattr(error, "errno", None)
-    if reason == errno.EACCES:
+    number = getattr(error, "errno", None)
+    if number == errno.EACCES:
         step = "Join the group dialout (`sudo usermod -aG dialout $USER`), then log in again."
     elif guarded:
         step = "Wait some seconds: after a program was killed, its guardian switches the torque off. Then try again."
-    elif reason in _BUSY:
+    elif number in _BUSY:
         step = "Close the other program that uses this port (for example Dynamixel Wizard)."
     else:
         step = (f"Check the USB cable and {device}.port.", Do.FIND())
+    reason = os.strerror(number) if number else str(error)
     return DeviceNotFound(
-        f"Cannot open the {device}'s port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
+        f"Cannot open the {device}'s port {path}.", next_step=step, evidence={"reason": reason, "baud": baud}
     )
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from rig.cli.main import app
 from rig.core.json_form import plain
-from rig.core.next_steps import Do, as_steps, in_words, steps_from_json
+from rig.core.next_steps import Do, as_steps, for_bench, in_words, steps_from_json
 from tests.fuzzing import examples
 
 ROOT = Path(__file__).parents[3]
@@ -127,3 +127,10 @@ def test_no_next_step_names_a_command_in_a_text():
                 wrong.append(f"{where}:{value.lineno}: {found[0]}")
     assert seen > 300
     assert not wrong
+
+
+def test_commands_for_a_bench_select_it_unless_they_name_one():
+    steps = ("Look.", Do.LIST_OBJECTS(), Do.ENROLL(bench="hardware"))
+    words = in_words(for_bench(steps, ("--bench", "sim")))
+    assert "`rig catalog list --bench sim`" in words
+    assert "`rig enroll NAME --bench hardware`" in words
