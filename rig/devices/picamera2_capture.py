@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.core.errors import DeviceNotFound
+from rig.core.next_steps import Do
 from rig.devices import v4l2
 
 INSTALL: Final = (
@@ -312,7 +313,7 @@ class Picamera2Capture:
         if main["format"] != _FORMAT:
             raise DeviceNotFound(
                 f"libcamera delivers {main['format']} images of this camera, so it is not on a ribbon cable.",
-                next_step="Open a USB camera by its device file: `rig find` lists them.",
+                next_step=("Open a USB camera by its device file. To list them,", Do.FIND()),
                 evidence={"format": main["format"]},
             )
         self._size = tuple(main["size"])  # libcamera may align it
