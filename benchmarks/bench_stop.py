@@ -1,6 +1,7 @@
 """Time from STOP to torque off, by the servo's own log, in the situations in which STOP could be late.
 
-The servo is simulated in real time by another process, which logs each instruction that switches its torque. All
+The servo is simulated in real time by another process, which logs each goal, and each instruction that switches its
+torque. A table in motion brakes before its torque goes off, which takes about half a second. All
 processes use the same monotonic clock. ``--load 8`` runs eight busy processes beside each measurement but the idle
 ones. The simulated devices, the browser and the clients that press STOP have a higher priority if the system permits it
 (for example to root): at a real bench they do not share the computer's cores.
@@ -31,11 +32,14 @@ RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 LOGGING_BENCH = """
 import sys, time
 from sim.servo.device import SimServo
-log, usual = open(sys.argv.pop(1), "a", buffering=1), SimServo._on_torque_enable
-def logged(servo):
-    log.write(f"{time.monotonic_ns()} {servo.memory['Torque Enable']}\\n")
-    usual(servo)
-SimServo._on_torque_enable = logged
+log, switch, rotate = open(sys.argv.pop(1), "a", buffering=1), SimServo._on_torque_enable, SimServo._on_goal
+def switched(servo):
+    log.write(f"{time.monotonic_ns()} {'on' if servo.memory['Torque Enable'] else 'off'}\\n")
+    switch(servo)
+def rotated(servo, pursue):
+    log.write(f"{time.monotonic_ns()} goal\\n")
+    rotate(servo, pursue)
+SimServo._on_torque_enable, SimServo._on_goal = switched, rotated
 from rig.cli.main import main
 main()
 """
@@ -120,13 +124,20 @@ class ServedBench:
         with urllib.request.urlopen(request, timeout=60) as answer:
             return json.load(answer)
 
-    def torque_off_ns(self, after_ns: int) -> int:
-        """Return when the torque went off after a time, as the servo's log has it."""
+    def stopped_ns(self, after_ns: int) -> tuple[int, int]:
+        """Return when the servo got the goal at which it stopped, and when its torque went off, after a time.
+
+        A table at rest gets no goal: both are then the same.
+        """
         while True:
-            for line in (self.folder / "torque.log").read_text().splitlines():
-                at_ns, value = map(int, line.split())
-                if at_ns > after_ns and value == 0:
-                    return at_ns
+            goal_ns = None
+            for line in (self.folder / "servo.log").read_text().splitlines():
+                time, what = line.split()
+                if int(time) <= after_ns:
+                    continue
+                if what == "off":
+                    return goal_ns or int(time), int(time)
+                goal_ns = int(time) if what == "goal" else goal_ns
             CLOCK.sleep(0.02)
 
     def measure(self, stop: Callable[[], int]) -> float:
@@ -142,22 +153,22 @@ class ServedBench:
             CLOCK.sleep(0.05)
         CLOCK.sleep(random.uniform(0.3, 0.8))
         began_ns = stop()
-        return (self.torque_off_ns(began_ns) - began_ns) * 1e-9
+        return (self.stopped_ns(began_ns)[1] - began_ns) * 1e-9
 
 
 @contextmanager
 def served(folder: Path, objects: tuple[str, ...] = ("lamp",), views: int = 36) -> Iterator[ServedBench]:
     """Serve a bench with enrolled objects; the last one is on its table."""
     home = folder / "bench"
-    log = folder / "bench" / "torque.log"
+    log = folder / "bench" / "servo.log"
     simulated = subprocess.Popen(
-        [sys.executable, "-c", LOGGING_BENCH, str(folder / "torque.log"), "sim-bench", "--folder", str(home)],
+        [sys.executable, "-c", LOGGING_BENCH, str(folder / "servo.log"), "sim-bench", "--folder", str(home)],
         stdout=subprocess.PIPE,
         text=True,
     )
     assert simulated.stdout is not None
     simulated.stdout.readline()
-    log.symlink_to(folder / "torque.log")
+    log.symlink_to(folder / "servo.log")
     base = ["--config", str(home / "rig.toml"), "--set", f"catalog.path={folder}/catalog"]
     for name in objects:  # on a bench with a clock of its own: this takes less time than on that of real time
         words = ["--bench", "sim", "--set", f"bench.sim.object={name}", "--views", str(views)]

@@ -2,8 +2,8 @@
 
 Each viewer does what the page Identify does: it listens to the events, and asks for one live image after the other.
 The operator identifies near twins, and presses STOP at a random time of most searches, on the connection of the page.
-The servo is simulated by another process, whose log has the time at which the torque went off
-(`benchmarks.bench_stop`).
+The servo is simulated by another process, whose log has the times at which it was told to stop, and at which its torque
+went off (`benchmarks.bench_stop`).
 The viewers run on the same computer, and share its cores with the server.
 """
 
@@ -116,6 +116,7 @@ async def watch(url: str, token: str, number: int) -> None:
 
 def operate(bench: ServedBench, seconds: float) -> None:
     """Identify, and press STOP, until the time is over; print how late STOP was."""
+    brakes_s: list[float] = []
     off_s: list[float] = []
     confirmed_s: list[float] = []
     states: dict[str, int] = {}
@@ -135,11 +136,14 @@ def operate(bench: ServedBench, seconds: float) -> None:
                     pressed_ns, ended, confirmed_ns = confirmations.get(timeout=60)
                     assert pressed_ns == began_ns
                     confirmed_s += [(confirmed_ns - began_ns) * 1e-9] if ended else []
-                    off_s.append((bench.torque_off_ns(began_ns) - began_ns) * 1e-9)
+                    brakes_ns, off_ns = bench.stopped_ns(began_ns)
+                    brakes_s.append((brakes_ns - began_ns) * 1e-9)
+                    off_s.append((off_ns - began_ns) * 1e-9)
                     stop_ns = end_ns + 60_000_000_000
                 CLOCK.sleep(0.05)
             states[state] = states.get(state, 0) + 1
     print(f"Searches: {states}")
+    print(f"STOP until the servo is told to stop: {words(brakes_s)}")
     print(f"STOP until the torque is off:         {words(off_s)}")
     print(f"STOP until the page has confirmation: {words(confirmed_s)}; {len(off_s) - len(confirmed_s)} were late")
 
