@@ -145,7 +145,7 @@ def operate(bench: ServedBench, seconds: float) -> None:
             states[state] = states.get(state, 0) + 1
     print(f"Searches: {states}")
     late = sum(one > LATE_S for one in brakes_s)
-    print(f"STOP until the servo is told to stop: {words(brakes_s)}; {late} took more than {LATE_S} s")
+    print(f"STOP until the servo has it:            {words(brakes_s)}; {late} took more than {LATE_S} s")
     print(f"STOP until the torque is off:         {words(off_s)}")
     print(f"STOP until the page has confirmation: {words(confirmed_s)}; {len(off_s) - len(confirmed_s)} were late")
 
