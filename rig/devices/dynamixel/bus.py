@@ -79,6 +79,8 @@ class DynamixelBus:
     def __init__(self, port: ClockedPort, retries: int = 3) -> None:
         self.port = port
         self.statistics = BusStatistics()
+        self.asked_ns = 0
+        """When the last attempt of a transaction began."""
         self.sampled_ns = 0
         """When the device began to send the last block that was read; it had sampled its registers just before."""
         self.packets = Packets()
@@ -200,7 +202,7 @@ class DynamixelBus:
                 try:
                     if self._unanswered:  # the reply to it may be on its way
                         self.port.drain()
-                    self._unanswered = True
+                    self._unanswered, self.asked_ns = True, self.port.clock.now_ns()
                     replies, result = attempt()
                 except (serial.SerialException, OSError) as unplugged:
                     self.port.lost = True  # `reconnect` opens it again

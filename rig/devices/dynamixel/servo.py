@@ -325,8 +325,9 @@ class DynamixelServo:
             block = self._blocks[first, last] = Block.of(self._table, first, last)
         begun_ns = self._clock.now_ns()
         image = self.bus.read_block(self._id, block.address, block.layout.size, dated=dated)
-        ended_ns = self._clock.now_ns()
-        return (begun_ns + ended_ns) // 2, block.values(image)
+        # The attempts before the answered one say nothing about when the servo's clock was read.
+        asked_ns, ended_ns = self.bus.asked_ns if dated else begun_ns, self._clock.now_ns()
+        return (asked_ns + ended_ns) // 2, block.values(image)
 
     def _read_fresh(self) -> tuple[int, dict[str, int]]:
         """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""

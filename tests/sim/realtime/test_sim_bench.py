@@ -40,7 +40,8 @@ from tests.fuzzing import fuzz_settings
 from tests.programs import until
 
 CLOCK = SystemClock()
-PATIENT = ("table.watchdog_s=2.5", "head.deadman_s=2.0", "servo.retries=20")
+RETRIES = "servo.retries=20"
+PATIENT = ("table.watchdog_s=2.5", "head.deadman_s=2.0", RETRIES)
 """Settings with which a busy computer may pause this program and the bench."""
 LEFT = {"lock", "rig.toml"}
 """What an ended bench leaves that no program has moved."""
@@ -84,7 +85,7 @@ def error_of(call: Callable[[], object]) -> int | None:
 
 def ping(folder: Path) -> int:
     """Return the servo's id, asked through its port."""
-    config = load_config(folder / "rig.toml")
+    config = load_config(folder / "rig.toml", (RETRIES,))
     connection = open_serial(config.servo.port, config.servo.baud)
     try:
         return open_servo(connection, config.servo, CLOCK).identity.bus_id
