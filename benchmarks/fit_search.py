@@ -2,8 +2,8 @@
 
 `python -m benchmarks.fit_search COIL-100 ETH-80 [--objects N] [--conditions NAME ...] [--keep-prior] [--out FOLDER]`
 
-The weights of the network must be installed. It takes less than an hour on two cores with ``--keep-prior``. The shipped
-``evidence.json`` was made so. Objects 1-50 of COIL-100 and every second one of ETH-80 are searched for,
+The weights of the network must be installed. It takes less than an hour on two cores with ``--keep-prior``, which made
+the shipped ``evidence.json``, from rows that were collected one condition after the other. Objects 1-50 of COIL-100 and every second one of ETH-80 are searched for,
 among all that a condition enrolls. There are two steps:
 
 - The prior: means, covariances and spreads of the enrolled views of objects 1-50 of COIL-100.
@@ -60,7 +60,7 @@ CONDITIONS: Final = {
 _SMALL: Final = (1, 4)
 #: Directions of each covariance that the prior keeps; the rest is a variance for each entry.
 _DIRECTIONS: Final = 96
-#: Views of each search; the numbers of later views hardly differ, and take as long again.
+#: Views of each search that the shipped weights were fitted to; a search can take twice as many.
 _VIEWS: Final = 4
 #: Hidden units of each network, and how many networks from different starts are averaged.
 _UNITS, _STARTS = 8, 3

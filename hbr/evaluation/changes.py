@@ -142,8 +142,8 @@ def search_changed(
     results = []
     left_out = _without(index, item.name)
     for views_so_far in searches(item, experiment):
-        search = _Search(index, enrolled)
-        without = None if left_out is None else _Search(left_out, enrolled)
+        search = _Search(index, enrolled, views_so_far.most)
+        without = None if left_out is None else _Search(left_out, enrolled, views_so_far.most)
         both = [search] if without is None else [search, without]
         for views, azimuth_deg in views_so_far.views:
             for one in both:
@@ -160,6 +160,8 @@ class SearchViews(NamedTuple):
 
     views: Iterator[tuple[ViewsTogether, float]]
     """Yields the views so far, and the azimuth of the last one in degrees."""
+    most: int
+    """Number of views."""
     other_bench: bool
     """Whether its empty-table image certainly shows another bench than that of the enrollment."""
 
@@ -176,10 +178,10 @@ def searches(item: PhotographedObject, experiment: Experiment) -> Iterator[Searc
     for trial in range(experiment.protocol.trials):
         rng = generator(experiment.protocol.seed, item.name, "trial", trial)
         scene = _search_scene(experiment, rng)
-        wanted_deg = rng.uniform(0, 360) + _VIEWS_DEG
+        places = _query_places(item, experiment, rng.uniform(0, 360) + _VIEWS_DEG)
         empty = None if before is None else scene.empty()
         other_bench = before is not None and empty is not None and before.shows_another_bench(empty)
-        yield SearchViews(_views_so_far(item, experiment, scene, empty, wanted_deg), other_bench)
+        yield SearchViews(_views_so_far(item, experiment, scene, empty, places), len(places), other_bench)
 
 
 def _views_so_far(
@@ -187,11 +189,11 @@ def _views_so_far(
     experiment: Experiment,
     scene: _Scene,
     empty: ImageArray | None,
-    wanted_deg: NDArray[np.float64],
+    places: Sequence[int],
 ) -> Iterator[tuple[ViewsTogether, float]]:
     views = ViewsTogether(experiment.condition.descriptor)
     table = None if empty is None else Background(empty)
-    for place in _query_places(item, experiment, wanted_deg):
+    for place in places:
         views.add(scene.frame(item, place), table)
         yield views, item.photographs[place].azimuth_deg
 
@@ -208,8 +210,8 @@ def _with_left_out(result: SearchResult, other: SearchResult) -> SearchResult:
 class _Search:
     """A search that continues after its end, to record the leading object after each view."""
 
-    def __init__(self, index: DenseIndex, enrolled: Callable[[str], EnrolledViews]) -> None:
-        self._session = DenseSession(index, max_views=MAX_VIEWS, most_changes=0)
+    def __init__(self, index: DenseIndex, enrolled: Callable[[str], EnrolledViews], most: int) -> None:
+        self._session = DenseSession(index, max_views=most, most_changes=0)
         self._names = index.views.object_names
         self._enrolled = enrolled
         self._leaders: list[str] = []
@@ -379,16 +381,19 @@ def _enrolled_places(item: PhotographedObject, experiment: Experiment) -> list[i
 
 
 def _query_places(item: PhotographedObject, experiment: Experiment, azimuth_deg: NDArray[np.float64]) -> list[int]:
-    """Return the photographs nearest to the azimuths; without a change, of those that are not enrolled."""
+    """Return the photographs nearest to the azimuths; without a change, of those that are not enrolled.
+
+    A search has no more views than there are such photographs.
+    """
     if experiment.change != "none":
         return nearest_photographs(item, azimuth_deg)
     others = np.flatnonzero(~views_enrolled(item.azimuth_deg, experiment.protocol.enrolled or 0))
-    if len(others) < MAX_VIEWS:
+    if len(others) < _RANKED:
         raise ValueError(
-            f"{item.name} has {len(others)} photographs that are not enrolled; a search needs {MAX_VIEWS}: enroll fewer"
+            f"{item.name} has {len(others)} photographs that are not enrolled; a search needs {_RANKED}: enroll fewer"
         )
     left = replace(item, photographs=tuple(item.photographs[place] for place in others))
-    return [int(others[place]) for place in nearest_photographs(left, azimuth_deg)]
+    return [int(others[place]) for place in nearest_photographs(left, azimuth_deg[: len(others)])]
 
 
 def cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[np.bool_]]:

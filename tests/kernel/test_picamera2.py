@@ -55,15 +55,17 @@ for one in held:
     one.release()
 found["with buffers"] = capture.wait(20.0)
 print(json.dumps(found), flush=True)
+
+def first_error():
+    while True:
+        try:
+            camera.capture(clock.now_ns())
+        except Exception as error:
+            return error
 """
 HANG = """
 print("hang", flush=True)
-silent = None
-while silent is None:
-    try:
-        camera.capture(clock.now_ns())
-    except Exception as error:
-        silent = error
+silent = first_error()
 print("silent:", type(silent).__name__, silent, flush=True)
 while True:
     try:
@@ -75,12 +77,7 @@ print("frames", flush=True)
 """
 GONE = """
 print("unplug", flush=True)
-gone = None
-while gone is None:
-    try:
-        camera.capture(clock.now_ns())
-    except Exception as error:
-        gone = error
+gone = first_error()
 print("gone:", type(gone).__name__, gone, flush=True)
 camera.close()
 camera.close()

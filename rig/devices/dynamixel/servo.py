@@ -210,7 +210,7 @@ class DynamixelServo:
         )
 
     def read_condition(self) -> ServoCondition:
-        _, values = self._read_block(*_CONDITION)
+        values = self._read_block(*_CONDITION)
         watchdog = values["Bus Watchdog"]
         tripped = watchdog == WATCHDOG_TRIPPED
         return ServoCondition(
@@ -315,24 +315,22 @@ class DynamixelServo:
     def _hardware_errors(self) -> tuple[str, ...]:
         return hardware_errors(self._read("Hardware Error Status"))
 
-    def _read_block(self, first: str, last: str, *, dated: bool = False) -> tuple[int, dict[str, int]]:
-        """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name.
+    def _read_block(self, first: str, last: str, *, dated: bool = False) -> dict[str, int]:
+        """Read the registers from ``first`` to ``last`` in one transaction; return their values by name.
 
         ``dated`` if the registers contain the servo's clock, which the caller checks.
         """
         block = self._blocks.get((first, last))
         if block is None:
             block = self._blocks[first, last] = Block.of(self._table, first, last)
-        begun_ns = self._clock.now_ns()
-        image = self.bus.read_block(self._id, block.address, block.layout.size, dated=dated)
-        # The attempts before the answered one say nothing about when the servo's clock was read.
-        asked_ns, ended_ns = self.bus.asked_ns if dated else begun_ns, self._clock.now_ns()
-        return (asked_ns + ended_ns) // 2, block.values(image)
+        return block.values(self.bus.read_block(self._id, block.address, block.layout.size, dated=dated))
 
     def _read_fresh(self) -> tuple[int, dict[str, int]]:
         """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""
         for _ in range(_FRESH_ATTEMPTS):
-            time_ns, values = self._read_block(*_STATE, dated=True)
+            values = self._read_block(*_STATE, dated=True)
+            # Attempts before the answered one say nothing about when the servo read its clock.
+            time_ns = (self.bus.asked_ns + self._clock.now_ns()) // 2
             if self._is_fresh((time_ns, values["Realtime Tick"])):
                 return time_ns, values
         raise DeviceFault(

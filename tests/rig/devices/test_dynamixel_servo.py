@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.core.clock import seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.servo import MotionProfile
@@ -91,3 +92,16 @@ def test_tripped_watchdog_is_cleared_only_by_torque_on(wires, servo):
     assert abs(wires.world.shaft()[1]) < 1e-9
     servo.torque_on()
     assert wires.device.memory["Bus Watchdog"] == 0
+
+
+def test_reading_has_the_time_of_the_attempt_that_was_answered():
+    """Else the servo's clock would not agree, and a busy computer would take a good servo for a broken one."""
+    wires = servo_wires()
+    servo, clock = open_servo(wires), wires.world.clock
+    servo.read_state()
+    lost = iter([True, True])
+    wires.bus.filters.append(lambda frame: None if next(lost, False) else frame)
+    before = servo.bus.statistics.transactions
+    state = servo.read_state()
+    assert servo.bus.statistics.transactions == before + 3
+    assert seconds_between(state.time_ns, clock.now_ns()) < 0.01

@@ -233,6 +233,13 @@ def test_photographs_are_searched_for_in_those_that_are_not_enrolled(photographs
     assert swapped["searches"]["obj3"] == clean["searches"]["obj3"]
     assert run(folder, keys, "--noise", "gn", "--out", tmp_path / "noisy").exit_code == 0
     assert results(tmp_path / "noisy")["searches"] != swapped["searches"]
+    # Each of the twelve photographs is enrolled or a query: a search with few queries has fewer views.
+    for enrolled, most in ((4, 8), (8, 4)):
+        few = keys.replace("enrolled = 4", f"enrolled = {enrolled}")
+        assert run(photographs, few, "--noise", "gn", "--out", tmp_path / "few").exit_code == 0
+        searches = [one for each in results(tmp_path / "few")["searches"].values() for one in each]
+        assert {len(one["leaders"]) for one in searches} == {4}
+        assert max(one["views"] for one in searches) <= most
 
 
 @pytest.mark.parametrize(
