@@ -3,8 +3,8 @@
 `python -m benchmarks.fit_search COIL-100 ETH-80 [--objects N] [--conditions NAME ...] [--keep-prior] [--out FOLDER]`
 
 The weights of the network must be installed. It takes less than an hour on two cores with ``--keep-prior``, which made
-the shipped ``evidence.json``, from rows that were collected one condition after the other. Objects 1-50 of COIL-100 and every second one of ETH-80 are searched for,
-among all that a condition enrolls. There are two steps:
+the shipped ``evidence.json``, from rows that were collected one condition after the other. Objects 1-50 of COIL-100 and
+every second one of ETH-80 are searched for, among all that a condition enrolls. There are two steps:
 
 - The prior: means, covariances and spreads of the enrolled views of objects 1-50 of COIL-100.
 - The evidence: each search, with its object enrolled and without it, in the whole catalog and in small ones, gives the
