@@ -18,8 +18,8 @@ from rig.core.next_steps import Do, SomeSteps
 READ_SLICE_S = 0.005  # an eighth of a period of the control loop
 """Longest time that one read blocks. It limits the delay of a timeout, and keeps the CPU idle."""
 
-BABBLE_GRACE_MS = 50.0  # longer than a long packet at 57,600 bit/s needs
-"""How long a packet may exceed its timeout while bytes keep arriving; the SDK itself has no limit."""
+BABBLE_BYTES = 300  # longer than any reply that the rig asks for
+"""How many bytes may arrive after a packet's timeout; the SDK itself has no limit."""
 
 QUIET_S, DRAIN_S = 0.005, 0.25
 """How long a bus must be quiet before the next request, and how long to wait for that."""
@@ -124,6 +124,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
         self.clock = clock
         self.lost = False
         self._reopen = reopen
+        self._late_bytes = 0
 
     def reconnect(self) -> bool:
         """Open a lost connection again; return whether there was one.
@@ -166,9 +167,19 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
         if length <= 0:
             return b""
         data: bytes = self.ser.read(length)
-        if data and self.getTimeSinceStart() > self.packet_timeout + BABBLE_GRACE_MS:
-            raise BusBabble
+        if self.getTimeSinceStart() > self.packet_timeout:
+            self._late_bytes += len(data)
+            if self._late_bytes > BABBLE_BYTES:
+                raise BusBabble
         return data
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        super().setPacketTimeout(packet_length)
+        self._late_bytes = 0
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        """Return whether the time is over and nothing is left to read: a busy computer may pause this program."""
+        return bool(super().isPacketTimeout()) and not self.ser.in_waiting
 
     def drain(self) -> None:
         """Drop what arrives until the bus has been quiet for `QUIET_S`.

@@ -7,7 +7,7 @@ Decision: docs/decisions/0007.
 
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Final
+from typing import Final, NamedTuple
 
 from rig.config import ServoConfig
 from rig.config.servos import DynamixelModel
@@ -38,7 +38,8 @@ WATCHDOG_TRIPPED = 0xFF  # e-manual, Bus Watchdog: reads as −1; goals are read
 
 TICK_MODULUS_MS = 32768  # e-manual, Realtime Tick: wraps after 32,767 ms
 TICK_TOLERANCE_MS, TICK_DRIFT = 20.0, 0.03
-"""How much the servo's clock (Realtime Tick) may differ from the computer's between two readings."""
+"""How much the servo's clock (Realtime Tick) may differ from the computer's between two readings, besides what is not
+known about when it was read."""
 TICK_MEMORY_S = 10.0  # the tick wraps after 33 s, and both clocks drift
 """After a longer pause, two readings must agree with each other instead."""
 _FRESH_ATTEMPTS, _RESTARTED = 8, 3
@@ -93,8 +94,8 @@ class DynamixelServo:
         self._dps2_per_unit = row.dps2_per_unit / gear_ratio
         self._kept: dict[str, int] = {}  # the permanent settings
         self._blocks: dict[tuple[str, str], Block] = {}
-        self._tick: tuple[int, int] | None = None  # time and Realtime Tick of the last fresh reading
-        self._unconfirmed: list[tuple[int, int]] = []  # readings that agree with each other, but not with it
+        self._tick: _Tick | None = None  # of the last fresh reading
+        self._unconfirmed: list[_Tick] = []  # of readings that agree with each other, but not with it
 
         # Compare the model, then read what its control table depends on.
         try:
@@ -330,36 +331,66 @@ class DynamixelServo:
         for _ in range(_FRESH_ATTEMPTS):
             values = self._read_block(*_STATE, dated=True)
             # Attempts before the answered one say nothing about when the servo read its clock.
-            time_ns = (self.bus.asked_ns + self._clock.now_ns()) // 2
-            if self._is_fresh((time_ns, values["Realtime Tick"])):
-                return time_ns, values
+            tick = _Tick.between(self.bus.asked_ns, self._clock.now_ns(), values["Realtime Tick"])
+            if self._is_fresh(tick):
+                self._tick = tick.dated(self._tick)
+                self._unconfirmed.clear()
+                return self._tick.time_ns, values
         raise DeviceFault(
             f"The servo's readings are impossible: {_FRESH_ATTEMPTS} readings in a row do not agree with its clock.",
             next_step=("Check its cable. If this repeats, replace the servo.", Do.ACKNOWLEDGE(reboot=True)),
         )
 
-    def _is_fresh(self, reading: tuple[int, int]) -> bool:
+    def _is_fresh(self, tick: "_Tick") -> bool:
         """Return whether a reading is new: its tick has advanced as the computer's clock has since the last one.
 
         The clock of a servo that restarted is different: several readings must then agree with each other.
         """
-        recent = self._tick is not None and seconds_between(self._tick[0], reading[0]) <= TICK_MEMORY_S
-        if not (recent and self._tick is not None and _ticks_agree(self._tick, reading)):
-            if not (self._unconfirmed and _ticks_agree(self._unconfirmed[-1], reading)):
-                self._unconfirmed.clear()
-            self._unconfirmed.append(reading)
-            if len(self._unconfirmed) < (_RESTARTED if recent else 2):
-                return False
-        self._tick = reading
-        self._unconfirmed.clear()
-        return True
+        if tick.agrees(self._tick):
+            return True
+        if not (self._unconfirmed and tick.agrees(self._unconfirmed[-1])):
+            self._unconfirmed.clear()
+        self._unconfirmed.append(tick)
+        return len(self._unconfirmed) >= (_RESTARTED if tick.is_recent(self._tick) else 2)
 
 
-def _ticks_agree(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
-    """Return whether the servo's clock and the computer's advanced equally between two readings."""
-    passed_ms = seconds_between(earlier[0], later[0]) * 1e3
-    difference_ms = (later[1] - earlier[1] - passed_ms + TICK_MODULUS_MS / 2) % TICK_MODULUS_MS - TICK_MODULUS_MS / 2
-    return abs(difference_ms) <= TICK_TOLERANCE_MS + TICK_DRIFT * passed_ms
+class _Tick(NamedTuple):
+    """The servo's clock in a reading: ``tick_ms`` was read at ``time_ns``, ``doubt_ms`` earlier or later."""
+
+    time_ns: int
+    doubt_ms: float
+    tick_ms: int
+
+    @classmethod
+    def between(cls, asked_ns: int, answered_ns: int, tick_ms: int) -> "_Tick":
+        return cls((asked_ns + answered_ns) // 2, seconds_between(asked_ns, answered_ns) * 500, tick_ms)
+
+    def is_recent(self, earlier: "_Tick | None") -> bool:
+        return earlier is not None and seconds_between(earlier.time_ns, self.time_ns) <= TICK_MEMORY_S
+
+    def agrees(self, earlier: "_Tick | None") -> bool:
+        """Return whether the servo's clock and the computer's advanced equally since an earlier, recent reading."""
+        if earlier is None or not self.is_recent(earlier):
+            return False
+        shift_ms, doubt_ms = self._shift_ms(earlier)
+        return abs(shift_ms) <= TICK_TOLERANCE_MS + doubt_ms + self.doubt_ms
+
+    def dated(self, earlier: "_Tick | None") -> "_Tick":
+        """Return the reading with a better time, by an earlier one, if the answer took long: the computer is busy."""
+        if earlier is None or self.doubt_ms <= TICK_TOLERANCE_MS or not self.agrees(earlier):
+            return self
+        shift_ms, doubt_ms = self._shift_ms(earlier)
+        if doubt_ms >= self.doubt_ms:
+            return self
+        moved_ms = min(max(shift_ms, -self.doubt_ms), self.doubt_ms)
+        return self._replace(time_ns=self.time_ns + round(moved_ms * 1e6), doubt_ms=doubt_ms)
+
+    def _shift_ms(self, earlier: "_Tick") -> tuple[float, float]:
+        """Return how much later than `time_ns` the clock was read, by an earlier reading; and the doubt of that."""
+        passed_ms = seconds_between(earlier.time_ns, self.time_ns) * 1e3
+        ahead_ms = self.tick_ms - earlier.tick_ms - passed_ms
+        wrapped_ms = (ahead_ms + TICK_MODULUS_MS / 2) % TICK_MODULUS_MS - TICK_MODULUS_MS / 2
+        return wrapped_ms, earlier.doubt_ms + TICK_DRIFT * passed_ms
 
 
 def hardware_errors(bits: int) -> tuple[str, ...]:

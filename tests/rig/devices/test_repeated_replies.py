@@ -9,6 +9,7 @@ from rig.core.errors import RigError
 from rig.devices.dynamixel.servo import open_servo as open_configured
 from sim.devices import SimDevices
 from sim.noise import NoiseModel
+from sim.servo import Sender
 from sim.world import World
 from tests.rig.bench_parts import open_servo, servo_wires
 
@@ -97,3 +98,32 @@ def test_reading_after_a_long_pause_is_confirmed_by_a_second_one():
     sent = len(wires.instructions)
     servo.read_state()
     assert len(wires.instructions) == sent + 2
+
+
+def test_readings_of_a_busy_computer_are_new_and_not_older_than_their_time_says(monkeypatch):
+    """The computer may pause before a request leaves the program, or after the answer has arrived."""
+    wires, rng = servo_wires(NoiseModel.none()), random.Random(1)
+    servo, clock = open_servo(wires), wires.world.clock
+    write, read = wires.serial.write, wires.serial.read
+    pauses_s = [0.0, 0.0]  # before the request, and after the answer
+
+    def paused_write(data):
+        clock.sleep(pauses_s[0])
+        return write(data)
+
+    def paused_read(size):
+        data = read(size)
+        clock.sleep(pauses_s[1] if data else 0.0)
+        return data
+
+    monkeypatch.setattr(wires.serial, "write", paused_write)
+    monkeypatch.setattr(wires.serial, "read", paused_read)
+    servo.read_state()
+    for n in range(200):
+        clock.sleep(rng.uniform(0.0, 0.05))
+        busy = n % 10 > 0
+        pauses_s[:] = [rng.uniform(0.0, 0.3) * (rng.random() < 0.5) * busy for _ in range(2)]
+        sent = len(wires.sent)
+        state = servo.read_state()
+        assert sum(frame.source is Sender.HOST for frame in wires.sent[sent:]) == 1
+        assert abs(state.time_ns - wires.sent[-1].start_ns) < 60e6
