@@ -7,7 +7,6 @@ improves the segmentation of the first one. Further views hardly improve those t
 """
 
 from dataclasses import replace
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -17,8 +16,7 @@ from hbr.descriptors.base import Descriptor
 from hbr.descriptors.registry import descriptor as descriptor_of
 from hbr.segmentation import BoxMethod, Segmentation, hypotheses
 from hbr.segmentation.background import Background, SegmentedFrame, shrunk
-from hbr.segmentation.cut_out import Found
-from hbr.segmentation.segment import MOST_HYPOTHESES, without_background
+from hbr.segmentation.segment import MOST_HYPOTHESES
 
 #: Largest number of views that the background is learned from.
 _MOST: Final = 9
@@ -109,8 +107,8 @@ class ViewsTogether:
 
         ``empty_table`` is the empty-table image for this view, as for `hbr.segment`.
 
-        If many views are not revised, the object is guessed only in the first one. If the image is not stored, `revise`
-        does not change the view's segmentations, and a long search needs less memory.
+        The object is guessed only in the first view. If the image is not stored, `revise` does not change the view's
+        segmentations, and a long search needs less memory.
 
         Raises `TypeError`, `ValueError`: as for `hbr.segment`, or the view has another size than the others.
         """
@@ -142,24 +140,20 @@ class ViewsTogether:
         """Segment the views whose background was not known again, with the background that the other views show."""
         for view, found in enumerate(self.segmentations):
             if self._frames[view] is not None and (not found or found[0].method not in _RELIABLE):
-                self._describe(view, guess=self._several)
+                self._describe(view)
 
-    def _describe(self, view: int, *, guess: bool = False) -> None:
+    def _describe(self, view: int) -> None:
         frame = self._frames[view]
         assert frame is not None
-        known = dict(zip(map(id, self.segmentations[view]), self.levels[view], strict=True))
+        before = self.segmentations[view]
+        known = dict(zip(map(id, before), self.levels[view], strict=True))
         found = hypotheses(
             frame,
             empty_table=self._tables[view],
             learned=self._learned.of(view),
-            alone=partial(self._without_background, view, frame) if guess else None,
+            alone=before if before and before[0].method in (BoxMethod.GUESS, BoxMethod.NETWORK) else (),
             most=MOST_HYPOTHESES if self._several else 1,
         )
         levels = [known[id(one)] if id(one) in known else self._descriptor.describe(one) for one in found]
         self.segmentations[view] = found
         self.levels[view] = np.stack(levels)
-
-    def _without_background(self, view: int, frame: SegmentedFrame) -> tuple[Segmentation | Found, ...]:
-        """Return the segmentations of a view that no other view changes."""
-        known = self.segmentations[view]
-        return known if known and known[0].method in (BoxMethod.GUESS, BoxMethod.NETWORK) else without_background(frame)
