@@ -7,6 +7,10 @@ shaft that lags behind its profile by the time τ, about the gyro's bias:
 
 All stops have the same ω, ζ and τ, and each its own A, B, C and c, which follow by linear least squares. The
 uncertainties come from fits without one of the stops (jackknife). `rig.motion.shaper` uses the result.
+
+It also needs the angle at which friction holds the shaft, to a few thousandths of a degree. Readings at rest are
+rounded to a count. In a slow motion the shaft passes many counts, and the mean of the readings is finer: it stays
+behind its profile by this angle, and by its speed times τ.
 """
 
 from collections.abc import Sequence
@@ -30,9 +34,14 @@ NAME = "table.ringing"
 
 Floats = NDArray[np.float64]
 
-SWING_DEG = 20.0  # a start and a stop at full acceleration, with a pause between them
+TARGETS_DEG = (20.0, 3.0, 20.0, 0.0)  # a start and a stop at full acceleration, with a pause between them
+"""Where the table stops in turn: each profile leaves some frequencies without ringing, so there are two distances."""
 MIN_STOPS = 4  # fewer do not show a scatter
 LISTEN_S = 2.0  # longer: more noise; shorter: the slowest ringing does not die down
+CREEP_DPS, CREEP_DEG, CREEP_POLL_S = 3.0, 6.0, 0.005  # faster: fewer readings; slower: some shafts stick and slip
+"""Speed, distance and time between readings of the slow motions."""
+STEADY_DEG, ENDS_DEG = 2.5, 0.5
+"""The shaft follows evenly from this angle after the start of a slow motion, until this one before its end."""
 DELAY_S = 0.015
 """Time after the end of the profile from which the rate is fitted: the gyro's own filter is past it."""
 HZ, DAMPING = np.geomspace(3.0, 40.0, 80), np.array([0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4])
@@ -97,30 +106,53 @@ class Ringing(Procedure):
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         stops, held_deg = [], []
-        with Turntable(bench, approach_deg=0.0, ringing_hz=0.0, quiet_dps=10.0) as table:
-            base_deg = lower_end(bench, table.rest_deg, SWING_DEG)
+        with Turntable(
+            bench, approach_deg=0.0, ringing_hz=0.0, quiet_dps=10.0, velocity_dps=CREEP_DPS, poll_s=CREEP_POLL_S
+        ) as table:
+            base_deg = lower_end(bench, table.rest_deg, max(TARGETS_DEG))
+            creeps = []
             with returning(table) as goto:
                 goto(base_deg)
-                for index in range(self.stops):
-                    move = goto(base_deg + (SWING_DEG if index % 2 == 0 else 0.0))
-                    rests_deg = []  # each reading is rounded to a count; their mean is finer
-                    for _round in range(round(LISTEN_S / 0.2)):  # less than a sensor's FIFO holds
-                        bench.clock.sleep(0.2)
-                        table.collect_gyro()
-                        rests_deg.append(table.angle_deg())
-                    stops.append(Stop.of(table.moves[-1]))
-                    goal_deg = table.moves[-1].readings[-1][2]  # the servo's own, rounded to a count as well
-                    held_deg.append(
-                        abs((move.commanded_deg if goal_deg is None else goal_deg) - float(np.mean(rests_deg)))
-                    )
-                    yield moved(index, move)
-        yield evaluate(stops, float(np.mean(held_deg)))
+                for target_deg in (base_deg + CREEP_DEG, base_deg):
+                    goto(target_deg)
+                    creeps.append(table.moves[-1])
+            bench.clock.sleep(LISTEN_S)  # until a platter with little damping is at rest
+        with Turntable(bench, approach_deg=0.0, ringing_hz=0.0, quiet_dps=10.0) as table, returning(table) as goto:
+            goto(base_deg)
+            for index in range(self.stops):
+                move = goto(base_deg + TARGETS_DEG[index % len(TARGETS_DEG)])
+                for _round in range(round(LISTEN_S / 0.2)):  # less than a sensor's FIFO holds
+                    bench.clock.sleep(0.2)
+                    table.collect_gyro()
+                stops.append(Stop.of(table.moves[-1]))
+                goal_deg = table.moves[-1].readings[-1][2]  # the servo's own, rounded to a count as well
+                held_deg.append(abs((move.commanded_deg if goal_deg is None else goal_deg) - table.angle_deg()))
+                yield moved(index, move)
+            goto(base_deg)
+            bench.clock.sleep(LISTEN_S)
+        yield evaluate(stops, float(np.mean(held_deg)), creeps)
 
 
-def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
-    """Fit frequency, damping and lag to the rates after ``stops``.
+def _held_deg(creeps: Sequence[MoveTrace], lag_s: float) -> float | None:
+    """Return the angle at which friction holds the shaft, by slow motions; None if the servo reports no profile."""
+    found = []
+    for trace in creeps:
+        _, goal_deg, profile = trace.goals[-1]
+        behind_deg = [
+            abs(at_deg - encoder_deg)
+            for _, encoder_deg, at_deg, _ in trace.readings
+            if at_deg is not None and abs(at_deg - trace.from_deg) > STEADY_DEG and abs(goal_deg - at_deg) > ENDS_DEG
+        ]
+        if not behind_deg:
+            return None
+        found.append(float(np.mean(behind_deg)) - profile.velocity_dps * lag_s)
+    return float(np.mean(found)) if found else None
 
-    ``held_deg`` is the distance from its goal at which the shaft rested.
+
+def evaluate(stops: Sequence[Stop], held_deg: float = 0.0, creeps: Sequence[MoveTrace] = ()) -> Evaluation:
+    """Fit frequency, damping and lag to the rates after ``stops``, and the friction to slow motions.
+
+    ``held_deg`` is the distance from its goal at which the shaft rested; it counts if the slow motions say nothing.
     """
     found = Evaluation(name=NAME, residual_unit="σ", limit=MAX_RESIDUAL)
     used = [stop.since(DELAY_S) for stop in stops]
@@ -129,7 +161,9 @@ def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
     squares = np.square(_residuals(used, *fitted))
     noise_dps = sqrt(float(squares[np.concatenate([stop.time_s for stop in used]) > 0.8 * LISTEN_S].mean()))
     found.residual = residual = sqrt(float(squares.mean())) / noise_dps
-    peak_dps, tail_dps = (float(np.median([np.abs(part[i]).max() for part in parts])) for i in range(2))
+    # the ringing of stops that ring: some distances, and stops downwards, leave little
+    peak_dps = float(np.quantile([np.abs(ringing).max() for ringing, _, _ in parts], 0.75))
+    tail_dps = float(np.median([np.abs(tail).max() for _, tail, _ in parts]))
     found.evidence = {"stops": len(stops), "noise_dps": noise_dps, "peak_dps": peak_dps, "tail_dps": tail_dps}
     if peak_dps < MIN_PEAK * noise_dps:
         return found.reject(RejectionCode.NO_RINGING, peak_dps=peak_dps, noise_dps=noise_dps)
@@ -148,11 +182,12 @@ def evaluate(stops: Sequence[Stop], held_deg: float = 0.0) -> Evaluation:
         "rate_dps": first.rate_dps.round(3).tolist(),
         "model_dps": (first.rate_dps - _residuals([first], *fitted)).round(3).tolist(),
     }
+    by_creeps = _held_deg(creeps, lag_s) if lags else None
     found.proposed = {
         "table.ringing_hz": round(hz, 3),
         "table.ringing_damping": round(damping, 4),
         "table.lag_s": round(lag_s, 4) if lags else 0.0,
-        "table.held_deg": round(held_deg, 3),
+        "table.held_deg": round(held_deg if by_creeps is None else by_creeps, 4),
     }
     found.reject_if(residual > MAX_RESIDUAL, RejectionCode.RINGING_UNCLEAR, residual=residual)
     found.reject_if(

@@ -172,6 +172,8 @@ class Arrival:
     goal_deg: float
     quiet_s: float
     allowed_s: float
+    has_arrived: bool = field(default=False, init=False)
+    """Whether the last reading was at the goal, perhaps not at rest yet."""
     _begun_ns: int = field(init=False)
     _readings: deque[tuple[int, float]] = field(default_factory=deque)
 
@@ -186,8 +188,12 @@ class Arrival:
         """
         readings = self._readings
         arrived = not state.moving and abs(angle_deg - self.goal_deg) <= self.config.tolerance_deg
+        self.has_arrived = arrived
         if not arrived:
             readings.clear()
+        # Besides the newest, a reading for each period counts: of more, the noise would spread further.
+        if len(readings) > 1 and seconds_between(readings[-2][0], readings[-1][0]) < self.config.poll_s:
+            readings.pop()
         readings.append((state.time_ns, angle_deg))
         if arrived and self._is_quiet() and (state.in_position or self._holds()):
             return sum(angle for _, angle in readings) / len(readings)

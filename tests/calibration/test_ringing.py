@@ -16,8 +16,7 @@ from tests.rig.bench_parts import LAG_S, at_rest, motion_bench
 OTHERS = [(hz, damping) for hz in FREQUENCIES_HZ for damping in DAMPINGS][1:]
 TABLES = [(6.0, 0.02), *(pytest.param(*table, marks=pytest.mark.nightly) for table in OTHERS)]
 """Frequency and damping of the simulated platter."""
-HARDLY_RINGS = (20.0, 0.2)  # the lag of the servo filters it, so its ringing is known less well
-SLOWER_S = {(13.0, 0.02): 0.21}  # the friction is known to 0.01° at best, and the time of its push follows from it
+HARDLY_RING = (13.0, 0.2), (20.0, 0.2)  # the lag of the servo filters it, so their ringing is known less well
 TARGETS_DEG = (10.0, 40.0, 35.0, 130.0, 30.0, 210.0, 30.0)
 
 
@@ -44,23 +43,38 @@ def test_calibrated_table_is_at_rest_at_once(hz, damping):
     with motion_bench(noise=NoiseModel(structure_hz=hz, structure_damping=damping), seed=3) as (bench, wires):
         *_, found = Ringing(6).measure(bench)
         assert isinstance(found, Evaluation)
+        if (hz, damping) in HARDLY_RING and not found.passed:
+            assert codes(found) == [RejectionCode.NO_RINGING]
+            assert max(settling_s(bench, wires, TARGETS_DEG)) < 0.15  # it needs no other profile
+            return
         assert found.passed, found.rejections
         for name, truth, limit in (("frequency", hz, 0.01 * hz), ("damping", damping, 0.05 * damping)):
             estimate = found.estimates[name]
-            within = 3 * estimate.uncertainty if (hz, damping) == HARDLY_RINGS else limit
+            within = 3 * estimate.uncertainty if (hz, damping) in HARDLY_RING else limit
             assert estimate.value == pytest.approx(truth, abs=within)
         assert found.estimates["lag"].value == pytest.approx(LAG_S, rel=0.05)
         ringing = {key.removeprefix("table."): value for key, value in found.settings.items()}
-        assert ringing["held_deg"] == pytest.approx(wires.device.motor.held_deg, abs=0.02)
-        assert max(settling_s(bench, wires, TARGETS_DEG, **ringing)) < SLOWER_S.get((hz, damping), 0.15)
+        assert ringing["held_deg"] == pytest.approx(wires.device.motor.held_deg, abs=0.008)
+        assert max(settling_s(bench, wires, TARGETS_DEG, **ringing)) < 0.15
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_friction_is_known_finer_than_a_count(seed):
+    """With the frictions of these seeds, the readings at rest are rounded by 0.01 to 0.02°."""
+    with motion_bench(noise=NoiseModel(structure_hz=6.0, structure_damping=0.02), seed=seed) as (bench, wires):
+        *_, found = Ringing(6).measure(bench)
+        assert found.settings["table.held_deg"] == pytest.approx(wires.device.motor.held_deg, abs=0.004)
+        ringing = {key.removeprefix("table."): value for key, value in found.settings.items()}
+        # when the torque is switched on, the shaft rests anywhere within its friction: the first move may ring
+        _, *times_s = settling_s(bench, wires, TARGETS_DEG, **ringing)
+        assert max(times_s) < 0.15
 
 
 def test_ringing_that_the_lag_of_the_servo_does_not_excite_needs_no_calibration():
     with motion_bench(noise=NoiseModel(structure_hz=20.0, structure_damping=0.3), seed=3) as (bench, wires):
         *_, found = Ringing(6).measure(bench)
         assert codes(found) == [RejectionCode.NO_RINGING]
-        times_s = settling_s(bench, wires, TARGETS_DEG)
-        assert max(times_s) < 0.15 + 2 * bench.config.table.poll_s
+        assert max(settling_s(bench, wires, TARGETS_DEG)) < 0.15
 
 
 def test_table_with_little_damping_never_rests_without_calibration():
