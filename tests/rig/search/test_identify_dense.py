@@ -136,12 +136,13 @@ def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simula
 
 
 @pytest.mark.parametrize(
-    ("name", "reason"), [("bottle-green", RotationReason.SEVERAL_POSES), ("box-tissues", RotationReason.NEW_SIDE)]
+    ("name", "yaw_deg", "reason"),
+    [("bottle-green", 300.0, RotationReason.SEVERAL_POSES), ("box-tissues", 0.0, RotationReason.NEW_SIDE)],
 )
-def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(simulated, shelf, name, reason):
+def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(simulated, shelf, name, yaw_deg, reason):
     """All strong hypotheses may be poses of one round object while a second object has 41 %."""
     s = simulated()
-    s.operator.yaw_deg = 0.0
+    s.operator.yaw_deg = yaw_deg
     events, _ = search(s, shelf, name)
     ranked = [event for event in events if isinstance(event, Ranked)]
     decided = [event for event in events if isinstance(event, Decided) and not event.candidates]

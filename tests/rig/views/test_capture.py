@@ -71,9 +71,15 @@ def test_delay_inside_the_camera_is_waited_for(on_the_table):
         assert (attempt.evidence.exposed_ns - camera.times.offset_ns < settled_ns - 2_000_000) is early
 
 
+def light_up(simulated, light) -> None:
+    """Change the light, for all frames from now on: an exposure may begin some milliseconds before its stamp."""
+    simulated.world.change(light=(light,) * 3)
+    simulated.world.clock.sleep(0.02)
+
+
 def test_darkness_is_rejected_until_the_retakes_are_used_up(on_the_table):
     s, table, viewer = on_the_table
-    s.world.change(light=(0.0, 0.0, 0.0))
+    light_up(s, 0.0)
     attempts = attempts_of(s, table, viewer)
     assert [a.number for a in attempts] == [1, 2, 3, 4]
     assert all(RejectReason.TOO_DARK in a.reasons for a in attempts)
@@ -82,7 +88,7 @@ def test_darkness_is_rejected_until_the_retakes_are_used_up(on_the_table):
 
 def test_short_darkness_costs_one_retake(on_the_table):
     s, table, viewer = on_the_table
-    s.world.change(light=(0.0, 0.0, 0.0))
+    light_up(s, 0.0)
     s.world.clock.call_at(s.bench.clock.now_ns() + 60_000_000, lambda: s.world.change(light=(1.0, 1.0, 1.0)))
     attempts = attempts_of(s, table, viewer)
     assert attempts[-1].accepted
@@ -113,7 +119,7 @@ def test_frames_that_the_camera_repeats_are_not_retakes(on_the_table, repeated):
 
 def test_glare_is_rejected(on_the_table):
     s, table, viewer = on_the_table
-    s.world.change(light=(30.0, 30.0, 30.0))
+    light_up(s, 30.0)
     assert RejectReason.OVEREXPOSED in attempts_of(s, table, viewer)[0].reasons
 
 
