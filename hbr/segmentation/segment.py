@@ -47,9 +47,8 @@ _TRACE: Final = 0.03
 _MOST: Final = 0.5
 #: A smaller expected overlap is reported.
 _DOUBTFUL: Final = 0.7
-#: With a larger one, the network's silhouette needs no other one beside it.
-# of 300 drawn frames after hard changes, 90 % have more; 1 % of these silhouettes overlap by less than 0.75 with the
-# object, and the difference from the empty table was never better by more than 0.1
+#: With a larger one and a learned background, the network does not look at the frame a second time without it.
+# that saves a third of a view's time; after hard changes, 98.0 % were decided right instead of 98.3 %
 _CERTAIN: Final = 0.85
 #: Smallest overlap of two boxes that count as one.
 _SAME_BOX: Final = 0.85
@@ -160,9 +159,8 @@ def hypotheses(
 
     A search compares the enrolled views with all of them, and the most similar one counts
     (`hbr.DenseSession.add` takes the levels of several segmentations as rows). The network sees the frame with all that
-    is known about its background; with the empty-table image, its silhouette counts alone if it is certain. What does
-    not rotate is not the object, also before a plain background: there the difference from the border contains a
-    visible platter. It counts first only if the network confirms it.
+    is known about its background. What does not rotate is not the object, also before a plain background: there the
+    difference from the border contains a visible platter. It counts first only if the network confirms it.
 
     Parameters
     ----------
@@ -199,17 +197,17 @@ def hypotheses(
     masks = _masks(share, levels)
     if masks and not _is_there(frame, share > min(levels), share, seen):
         masks = []
-    certain = seen is not None and bool(masks) and _expected(masks[0], share) >= _CERTAIN
-    lit = _lit(frame, background, difference)
-    like = lit if certain and not rotated else _found(lit, difference, guess=not rotated)
+    like = _found(_lit(frame, background, difference), difference, guess=not rotated)
     found: list[Segmentation | Found] = [replace(like, silhouette=mask, method=method) for mask in masks]
     only_platter = rotated and not found and like.silhouette is not None and _mean(platter, like.silhouette) > _MOST
     if like.box is not None and not only_platter:
-        guessed = not rotated and like.method is BoxMethod.GUESS
-        first = not found or guessed or _same(like, found[0])
+        # the network may cut off a thin handle, which the difference from the empty-table image shows
+        sure = like.method is BoxMethod.GUESS or (like.method is BoxMethod.EMPTY_TABLE and most > 1)
+        first = not found or (not rotated and sure) or _same(like, found[0])
         found.insert(0 if first else len(found), like)
     # before a plain background, what the rotation does not show is not there
     if rotated and most > 1 and (found or frame.differs is None):
+        certain = bool(masks) and _expected(masks[0], share) >= _CERTAIN
         found += alone or ([] if certain else _alone(frame, like))
     if not found:
         nothing = (Issue(IssueCode.NO_OBJECT),) if rotated else ()
