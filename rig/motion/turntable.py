@@ -315,7 +315,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         deadline_ns = self._clock.now_ns() + round(self._settle_s * 1e9)
         while True:
             try:
-                self._gyro.rest(duration_s)
+                self._gyro.rest(duration_s, self._safety.check_stop_request)
             except NotReady:
                 if self._clock.now_ns() >= deadline_ns:
                     raise

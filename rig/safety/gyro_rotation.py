@@ -26,6 +26,8 @@ Axis = Literal["x", "y", "z"]
 
 MEMORY_S = 2.0
 """Longer rests do not improve the bias, because it drifts during them."""
+MEANWHILE_S = 0.05  # longer: a stop waits for it
+"""Longest time between two looks for a request to stop while the gyro is averaged."""
 DRAIN_S, DRAIN_SAMPLES = 0.2, 60
 """Longest time, and largest number, of samples in the sensor's FIFO (170 in the MPU-6050), because reading uses the
 bus."""
@@ -182,8 +184,10 @@ class GyroRotationMeter:
         self.taps: list[Callable[[NDArray[np.int64], NDArray[np.float64]], object]] = []
         """Called with times and rates (°/s, about the table's axis, with the bias) of new samples."""
 
-    def rest(self, duration_s: float = 0.5) -> Bias:
+    def rest(self, duration_s: float = 0.5, meanwhile: Callable[[], object] = lambda: None) -> Bias:
         """Measure the bias during the present rest; wait until it has lasted ``duration_s``.
+
+        ``meanwhile`` is called many times a second while it waits.
 
         A slow and steady rotation looks like a bias, so the caller must know from the encoder that the table stands
         still. A rotation that was begun and not ended (its move was interrupted) is dropped.
@@ -200,7 +204,7 @@ class GyroRotationMeter:
             self._drain()
             self._moving, self._resting_ns = False, self._clock.now_ns()
             self._restart()
-        rate = self._wait_for_rest(duration_s)
+        rate = self._wait_for_rest(duration_s, meanwhile)
         mean = float(rate.mean())
         peak = float(np.abs(rate - mean).max())
         if peak > REST_PEAK_DPS or abs(mean) > MAX_BIAS_DPS:
@@ -337,7 +341,7 @@ class GyroRotationMeter:
         self._sum_dps, self._count = 0.0, 0
         self._issue, self._issue_limit = None, 0.0
 
-    def _wait_for_rest(self, duration_s: float) -> NDArray[np.float64]:
+    def _wait_for_rest(self, duration_s: float, meanwhile: Callable[[], object]) -> NDArray[np.float64]:
         """Return the rates of at least ``duration_s`` since the rest began or samples were lost."""
         needed = max(round(duration_s * self._imu.rate_hz), 2)
         deadline_ns = self._clock.now_ns() + round((2 * duration_s + 1.0) * 1e9)
@@ -352,7 +356,11 @@ class GyroRotationMeter:
                     next_step="Check its cable and supply, then open the bench again.",
                     evidence={"samples": rate.size, "needed": needed},
                 )
-            self._clock.sleep(min((needed - rate.size + 0.5) / self._imu.rate_hz, self._drain_s))
+            left_s = min((needed - rate.size + 0.5) / self._imu.rate_hz, self._drain_s)
+            while left_s > 0:
+                meanwhile()
+                self._clock.sleep(min(left_s, MEANWHILE_S))
+                left_s -= MEANWHILE_S
 
     def _noise(self, rate: NDArray[np.float64]) -> float:
         """Return the angle random walk in °/√s: the datasheet's value, or the measured one if that is larger."""

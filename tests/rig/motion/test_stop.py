@@ -10,7 +10,7 @@ import pytest
 
 from rig.config import load_config
 from rig.core.clock import seconds_between
-from rig.core.errors import BenchBusy, DeviceSilent, TorqueStaysOn, UsageError
+from rig.core.errors import BenchBusy, DeviceSilent, MotionStopped, TorqueStaysOn, UsageError
 from rig.devices.servo import ServoState
 from rig.jobs.stop import stop
 from rig.motion.arrival import stopping_deg
@@ -223,3 +223,19 @@ def test_program_that_does_not_answer_is_signalled_after_two_seconds(tmp_path, m
 def test_table_stops_where_its_profile_can_brake_unless_the_table_does_not_follow_it(profile, stops_deg):
     state = ServoState(0, 100.0, 48.0, 10.0, 12.0, 33.0, True, False, (), *profile)
     assert stopping_deg(state, 240.0, 0.0, 12.0) == pytest.approx(stops_deg)
+
+
+@pytest.mark.parametrize("after_s", [0.3, 0.7, 1.3])
+def test_a_stop_is_seen_while_the_gyro_is_averaged_before_the_first_move(after_s):
+    with motion_bench() as (bench, wires):
+        clock, asked_ns = wires.world.clock, []
+
+        def press():
+            asked_ns.append(clock.now_ns())
+            bench.state.request_stop()
+
+        clock.call_at(clock.now_ns() + round(after_s * 1e9), press)
+        with pytest.raises(MotionStopped), Turntable(bench, first_rest_s=2.0):
+            pass
+        assert (clock.now_ns() - asked_ns[0]) * 1e-9 < 0.1
+        assert wires.device.memory["Torque Enable"] == 0
