@@ -47,6 +47,9 @@ OFF_DEG: Final = 0.01  # an eighth of the count of an encoder
 """By how much the distance may be longer, which changes the time at the lower speed."""
 QUIET_SHARE: Final = 0.35  # the gyro's noise needs the rest
 """Share of `table.quiet_dps` that the ringing may have at the end."""
+LASTING: Final = 0.2
+LASTING_SHARE: Final = 0.25
+"""The same of a ringing that falls by less than the first number while the table must be quiet: it meets more noise."""
 TAIL_SHARE: Final = 0.9
 """The same of a shaft that lags behind, whose speed decreases further while the table must be quiet."""
 CREEP_DPS: Final = 1.0  # larger: the platter gets a push at an uncertain time; smaller: a reversal takes longer
@@ -164,7 +167,9 @@ def shaped(
         followed = abs(1 + pole(hz) * config.lag_s)  # the lag is a low-pass filter
         rate = np.maximum(rate, np.abs(total) * a / (2 * pi * hz * sqrt(1 - damping**2)) / followed)
     # Ringing that is left needs time to die down. That counts twice, because a motion is known better.
-    dying_s = np.log(np.maximum(rate / (QUIET_SHARE * config.quiet_dps), 1.0)) / (2 * pi * ringing_hz * damping)
+    falls = 2 * pi * ringing_hz * damping
+    share = LASTING_SHARE if falls * config.quiet_s < LASTING else QUIET_SHARE
+    dying_s = np.log(np.maximum(rate / (share * config.quiet_dps), 1.0)) / falls
     lag_s = max(config.lag_s, 1e-4)  # a shaft without a lag has no speed that is left
     slowed = np.exp(-(p + last) / lag_s) * (1 - np.exp(-np.maximum(first, 0) / lag_s))
     speed_dps = a * lag_s * (1 - np.exp(-last / lag_s) + slowed)
