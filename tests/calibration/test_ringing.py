@@ -16,7 +16,9 @@ from tests.rig.bench_parts import LAG_S, at_rest, motion_bench
 OTHERS = [(hz, damping) for hz in FREQUENCIES_HZ for damping in DAMPINGS][1:]
 TABLES = [(6.0, 0.02), *(pytest.param(*table, marks=pytest.mark.nightly) for table in OTHERS)]
 """Frequency and damping of the simulated platter."""
-HARDLY_RING = (13.0, 0.2), (20.0, 0.2)  # the lag of the servo filters it, so their ringing is known less well
+HARDLY_RINGS = (20.0, 0.2)  # the lag of the servo filters it, so its ringing is known less well
+STOPS = {(13.0, 0.2): 40, HARDLY_RINGS: 40}
+"""Of platters whose ringing dies down at once, more stops show it as well as six of the others do."""
 TARGETS_DEG = (10.0, 40.0, 35.0, 130.0, 30.0, 210.0, 30.0)
 
 
@@ -41,16 +43,12 @@ def settling_s(bench, wires, targets_deg, **ringing) -> list[float]:
 @pytest.mark.parametrize(("hz", "damping"), TABLES)
 def test_calibrated_table_is_at_rest_at_once(hz, damping):
     with motion_bench(noise=NoiseModel(structure_hz=hz, structure_damping=damping), seed=3) as (bench, wires):
-        *_, found = Ringing(6).measure(bench)
+        *_, found = Ringing(STOPS.get((hz, damping), 6)).measure(bench)
         assert isinstance(found, Evaluation)
-        if (hz, damping) in HARDLY_RING and not found.passed:
-            assert codes(found) == [RejectionCode.NO_RINGING]
-            assert max(settling_s(bench, wires, TARGETS_DEG)) < 0.15  # it needs no other profile
-            return
         assert found.passed, found.rejections
         for name, truth, limit in (("frequency", hz, 0.01 * hz), ("damping", damping, 0.05 * damping)):
             estimate = found.estimates[name]
-            within = 3 * estimate.uncertainty if (hz, damping) in HARDLY_RING else limit
+            within = 3 * estimate.uncertainty if (hz, damping) == HARDLY_RINGS else limit
             assert estimate.value == pytest.approx(truth, abs=within)
         assert found.estimates["lag"].value == pytest.approx(LAG_S, rel=0.05)
         ringing = {key.removeprefix("table."): value for key, value in found.settings.items()}

@@ -123,8 +123,10 @@ def find_kernel() -> Kernel:
         raise NotReady(f"{KERNEL}={path} names no kernel: `make kernel-test` says how to get one")
     kernel = Kernel(path, path if (path / "usr/bin/python3").exists() else Path("/"))
     programs = {kernel.architecture.qemu: kernel.architecture.package, **PACKAGES}
+    if kernel.files == Path("/"):  # else the folder has its own
+        programs["udevadm"] = "udev"
     if missing := [package for program, package in programs.items() if _found(program) is None]:
-        raise NotReady(f"packages are missing: sudo apt-get install --no-install-recommends {' '.join(missing)} udev")
+        raise NotReady(f"packages are missing: sudo apt-get install --no-install-recommends {' '.join(missing)}")
     return kernel
 
 

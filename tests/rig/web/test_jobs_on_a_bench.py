@@ -208,15 +208,16 @@ def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
     served.run(kind="goto", angle_deg=90)
     move = served.client.get("/api/v1/moves/last").json()
     assert (move["to_deg"], move["goals"][-1][1]) == (90, 90)
-    assert move["encoder_deg"][-1] == pytest.approx(90, abs=1)  # friction holds the table short of it
+    rest_deg = move["encoder_deg"][-1]
+    assert rest_deg == pytest.approx(89.6, abs=0.3)  # friction holds the table short of its goal
     assert served.run(kind="reference")["error"]["code"] == 200
     assert served.run(kind="reference", revolutions=5)["error"]["code"] == 200  # beyond the cable budget
     assert served.run(kind="reference", revolutions=-1)["state"] == "done"
-    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(-270, abs=1)
+    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(rest_deg - 360, abs=0.1)
     assert served.run(kind="reference", revolutions=0)["state"] == "done"
-    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(90, abs=1)
+    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(rest_deg, abs=0.1)
     assert served.run(kind="reference", here=True)["state"] == "done"
-    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(0, abs=1)
+    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(0, abs=0.1)
 
 
 def test_calibrations_are_offered_and_others_rejected(serve):
