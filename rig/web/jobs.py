@@ -290,7 +290,8 @@ class JobQueue:
         return job
 
     def _now(self) -> str:
-        return self._clock.utc().isoformat(timespec="seconds").replace("+00:00", "Z")
+        """Return the time to the millisecond: it is the order of jobs that begin in the same second."""
+        return self._clock.utc().isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     def _store(self, *changed: Job) -> None:
         """Store all jobs, and report those that have changed."""

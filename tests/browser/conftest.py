@@ -134,5 +134,6 @@ def page(chromium: Any) -> Iterator[Any]:
         ),
     )
     yield shown
+    print(shown.url, shown.inner_text("body"), sep="\n")  # pytest shows it if the test failed
     context.close()
     assert problems == []

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.browser.conftest import call, wait_for
 from tests.browser.test_day import PHONE
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
@@ -51,3 +52,19 @@ def test_errors_name_no_command_that_a_page_can_do(page, serve_process):
         ],
     )
     assert "at a terminal of the bench's computer: rig catalog verify" in page.inner_text("#messages")
+
+
+def test_late_list_of_jobs_does_not_replace_what_an_event_has_told(page, serve_process):
+    server = serve_process()
+    late = []
+    page.route("**/api/v1/jobs?limit=50", lambda route: late.append((route, route.fetch())))
+    job = call(server, "jobs", {"kind": "goto", "angle_deg": 90})["id"]
+    page.goto(server.url)
+    page.wait_for_selector("#job:has-text('done')")
+    wait_for(server, job, "done")
+    route, answer = late[0]
+    assert answer.json()["items"][0]["state"] != "done"
+    with page.expect_response("**/api/v1/jobs?limit=50"):
+        route.fulfill(response=answer)
+    page.evaluate("new Promise(requestAnimationFrame)")
+    assert "done" in page.inner_text("#job")

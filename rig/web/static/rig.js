@@ -411,6 +411,21 @@ export function jobTitle(job) {
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
 }
 
+// While a list of jobs is on its way, events may tell newer states than its answer has.
+const told = new Set();
+on("job", (job) => told.forEach((jobs) => jobs.set(job.id, job)));
+
+async function loadJobs(query = "limit=50") {
+  const newer = new Map();
+  told.add(newer);
+  try {
+    const { items } = await get(`/jobs?${query}`);
+    return items.map((job) => newer.get(job.id) || job);
+  } finally {
+    told.delete(newer);
+  }
+}
+
 // -- proposed jobs: every page shows them, and an operator approves or rejects them ---------------------------------------
 
 const proposed = new Map();
@@ -436,9 +451,9 @@ on("job", (job) => {
   if (job.state === "proposed" || proposed.delete(job.id)) showProposals();
 });
 on("hello", () => act(async () => {
-  const { items } = await get("/jobs?state=proposed");
   proposed.clear();
-  for (const job of items.reverse()) proposed.set(job.id, job);
+  const jobs = await loadJobs("state=proposed");
+  for (const job of jobs.reverse()) if (job.state === "proposed") proposed.set(job.id, job);
   showProposals();
 }));
 on("me", showProposals);
@@ -477,7 +492,6 @@ export function showJob(box, job, withOutcome = true) {
   return undefined;
 }
 
-const loadJobs = async () => (await get("/jobs?limit=50")).items;
 export const newestOf = (jobs) => jobs.find((job) => ACTIVE.includes(job.state)) || jobs[0];
 
 /** Return the events of a job so far, and the id of the last one; of an old identification those of its saved run. */
