@@ -412,17 +412,17 @@ export function jobTitle(job) {
 }
 
 // While a list of jobs is on its way, events may tell newer states than its answer has.
-const told = new Set();
-on("job", (job) => told.forEach((jobs) => jobs.set(job.id, job)));
+const loads = new Set();
+on("job", (job) => loads.forEach((jobs) => jobs.set(job.id, job)));
 
 async function loadJobs(query = "limit=50") {
   const newer = new Map();
-  told.add(newer);
+  loads.add(newer);
   try {
     const { items } = await get(`/jobs?${query}`);
     return items.map((job) => newer.get(job.id) || job);
   } finally {
-    told.delete(newer);
+    loads.delete(newer);
   }
 }
 
