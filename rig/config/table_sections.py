@@ -75,7 +75,8 @@ class TableConfig(Section):
         0.0, ge=0, le=5, description="distance from its goal at which friction holds the shaft, from that calibration"
     )
     quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
-    quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
+    # shorter: a platter that rings with 6 Hz is faster than quiet_dps only once in 0.083 s; longer: each view waits
+    quiet_s: float = Field(0.1, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
     watchdog_s: float = Field(
         0.5, ge=0.1, le=2.5, description="the servo stops by itself after this time without instructions"

@@ -75,18 +75,18 @@ def test_json_is_one_object_with_every_trial(in_json):
 
 
 def test_ambiguous_answers_are_a_count_of_their_own(small, in_json):
-    """After two views, each of the two mugs may still be the other one."""
+    """After two views, the first of the two mugs may still be the other one."""
     result = json.loads(in_json[0].stdout)
     assert [trial["possible"] for trial in result["trials"][:2]] == [
         ["mug-white", "mug-star"],
-        ["mug-star", "mug-white"],
+        ["mug-star"],
     ]
-    assert (result["found"], result["ambiguous"], result["of"]) == (0, 2, 2)
-    assert result["median_pose_error_deg"] is None
+    assert (result["found"], result["ambiguous"], result["of"]) == (1, 1, 2)
+    assert result["median_pose_error_deg"] < 5
     text = small[0].stdout
-    assert "0 of 2 enrolled objects found again, 2 ambiguous; 2 of 2 unknown objects recognised." in text
-    assert re.findall(r"^\?  (\S+) +ambiguous ", text, re.MULTILINE) == ["mug-white", "mug-star"]
-    assert "0 of 2 enrolled objects found again, 2 ambiguous;" in (small[1] / "report.html").read_text(encoding="utf-8")
+    assert "1 of 2 enrolled objects found again, 1 ambiguous; 2 of 2 unknown objects recognised." in text
+    assert re.findall(r"^\?  (\S+) +ambiguous ", text, re.MULTILINE) == ["mug-white"]
+    assert "1 of 2 enrolled objects found again, 1 ambiguous;" in (small[1] / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.nightly
