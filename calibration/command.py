@@ -33,7 +33,7 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
     from rig.cli.ui.desk import CommandDesk
 
     desk = CommandDesk(settings, with_json=True)  # a person must put the board there
-    if not desk.run(calibrated(desk, procedures)):
+    if not desk.run("calibrate", calibrated(desk, procedures)):
         raise typer.Exit(EXIT_QUALITY)
 
 

@@ -247,7 +247,8 @@ class BenchWorker:
             self.close()
         self.queue.end(job, state, error)
         bench = self.setup.bench
-        text = f"{bench}: {job.request.kind} {job.state}. {job.result_text}".strip()
+        why = job.result_text if job.error is None else job.error.detail
+        text = f"{bench}: {job.request.kind} {job.state}. {why}".partition("\n")[0].strip()
         notify(
             self.setup.config.notify_command,
             {"event": "job", "bench": bench, "text": text, "job": job.model_dump(mode="json")},

@@ -115,7 +115,9 @@ def record(
         port = context.computer.serial_port(context.config.servo.port)
     adapter = {key: port.usb.get(key) for key in ("idVendor", "idProduct")} if port else {}
     desk = CommandDesk(settings.tracing(file))
-    desk.run(record_job(desk, still=still, adapter={**adapter, "latency_ms": port.latency_ms if port else None}))
+    desk.run(
+        "record", record_job(desk, still=still, adapter={**adapter, "latency_ms": port.latency_ms if port else None})
+    )
 
 
 @app.command("replay")

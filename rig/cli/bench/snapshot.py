@@ -72,4 +72,4 @@ def empty_table(
     from rig.jobs.table_image import take_table_image
 
     desk = CommandDesk(settings)
-    desk.run(take_table_image(desk, anyway=anyway))
+    desk.run("empty-table", take_table_image(desk, anyway=anyway))

@@ -44,7 +44,7 @@ def goto(
     from rig.jobs.table import goto as goto_job
 
     desk = CommandDesk(settings)
-    desk.run(goto_job(desk, angle_deg))
+    desk.run("goto", goto_job(desk, angle_deg))
 
 
 @command
@@ -77,7 +77,8 @@ def home(
     if here and revolutions is not None:
         raise UsageError("--here and --revolutions cannot be combined.", next_step="Give one of them.")
     desk = CommandDesk(settings, yes=yes)
-    if not desk.run(refer(desk, here=True) if here else home_job(desk, revolutions=revolutions)) and not here:
+    job = refer(desk, here=True) if here else home_job(desk, revolutions=revolutions)
+    if not desk.run("reference" if here else "home", job) and not here:
         raise typer.Exit(EXIT_DECLINED)
 
 
@@ -203,7 +204,7 @@ def acknowledge(
     from rig.jobs.table import acknowledge as acknowledge_job
 
     desk = CommandDesk(settings)
-    desk.run(acknowledge_job(desk, reboot=reboot))
+    desk.run("acknowledge", acknowledge_job(desk, reboot=reboot))
 
 
 # longer: the shown angle is behind the table; shorter: the servo is asked more often than the eye needs
@@ -245,7 +246,7 @@ def jog(
 
     desk = CommandDesk(settings)
     with _keys_at_once():
-        desk.run(jog_job(desk, _pressed(step), step_deg=step), show)
+        desk.run("jog", jog_job(desk, _pressed(step), step_deg=step), show)
     print("The torque is off. To make this angle home: rig home --here", file=sys.stderr)
 
 

@@ -105,7 +105,7 @@ def enroll(
         else:
             job = enroll_list(desk, items, **how)
         try:
-            desk.run(job, show)
+            desk.run("tray" if name is None else "retake" if again else "enroll", job, show)
         except BaseException:
             view.hide()
             if stored_views and not again:

@@ -79,7 +79,7 @@ def identify(
             next_folder=None if save_run is None else partial(_run_folder, save_run, several=watch),
             live=view.add,
         )
-        answer = desk.run(job, view.add)
+        answer = desk.run("identify", job, view.add)
     if not isinstance(answer, Identified) or answer.outcome is Outcome.UNKNOWN:
         raise typer.Exit(EXIT_UNKNOWN)
     if answer.outcome is Outcome.AMBIGUOUS:

@@ -19,7 +19,7 @@ from rig.core.errors import RigError
 from rig.core.next_steps import in_words
 from rig.core.notify import notify, print_note
 from rig.doctor.finding import Finding, finding_words
-from rig.events.events import Event, event_dict
+from rig.events.events import Enrolled, Event, Identified, event_dict
 from rig.events.wording import line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Steps
 from rig.plans.operator import Operator, Unattended
@@ -80,18 +80,24 @@ class CommandDesk(Desk):
         text = " ".join(filter(None, (remark.text, in_words(remark.steps))))
         print(f"{'Note: ' if remark.is_warning else ''}{text}", file=sys.stderr, flush=True)
 
-    def run(self, steps: Steps[object], show: Callable[[Event], None] | None = None) -> object:
-        """Run a job to its end, and return what it returns; by default its events are printed line by line."""
-        last: Any = None
-        state, failure = "interrupted", None
+    def run(self, kind: str, steps: Steps[object], show: Callable[[Event], None] | None = None) -> object:
+        """Run a job to its end, and return what it returns; by default its events are printed line by line.
+
+        ``kind`` is the one of the server's jobs, for `notify_command`.
+        """
+        result: Any = None
+        state, failure, text = "interrupted", None, ""
         try:
             while True:
-                match last := next(steps):
+                step = next(steps)
+                if isinstance(step, Enrolled | Identified):
+                    result, text = event_dict(step), line(step)
+                match step:
                     case Remark() as remark:
                         self.note(remark)
-                    case JobResult() as result:
+                    case JobResult(values=result, text=text):
                         self._before()
-                        self._settings.say(result.text, result.values)
+                        self._settings.say(text, result)
                     case Progress() as progress:
                         values = {"event": "progress", "share": progress.share, "words": progress.words}
                         self._settings.say(progress.words, values)
@@ -105,18 +111,12 @@ class CommandDesk(Desk):
             state = "done"
             return end.value
         except RigError as error:
-            state, failure = "failed", error.problem
+            state, failure, text = "failed", error.problem, error.problem.detail
             raise
         finally:
             steps.close()
             if self.config.notify_command:
-                self._notify(getattr(steps, "__name__", "job"), state, failure, last)
-
-    def _notify(self, kind: str, state: str, failure: Any, last: Any) -> None:
-        """Tell the command of the user how a job ended, in the words of the server's jobs."""
-        result = last.values if isinstance(last, JobResult) else event_dict(last) if hasattr(last, "event") else None
-        job = {"kind": kind, "state": state, "error": failure, "result": result}
-        bench = self._settings.bench_name
-        notify(
-            self.config.notify_command, {"event": "job", "bench": bench, "text": f"{bench}: {kind} {state}", "job": job}
-        )
+                job = {"kind": kind, "state": state, "error": failure, "result": result}
+                bench = self._settings.bench_name
+                words = f"{bench}: {kind} {state}. {text}".partition("\n")[0].strip()
+                notify(self.config.notify_command, {"event": "job", "bench": bench, "text": words, "job": job})

@@ -102,7 +102,7 @@ def asked(
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
         monkeypatch.setattr("sys.stdin", answers)
         desk = CommandDesk(Settings(json=as_json))
-        desk.run(refresh_table_image(desk, s.bench, s.bench.placer, ask=ask, then="toy-car"))
+        desk.run("enroll", refresh_table_image(desk, s.bench, s.bench.placer, ask=ask, then="toy-car"))
         return empty_table_status(s.bench).table, capsys.readouterr().err
 
     return run

@@ -78,5 +78,26 @@ def test_command_reports_how_its_job_ended(tmp_path, angle, state):
     CliRunner().invoke(app, ["goto", angle, "--bench", "sim", "--seed", "1", *options])
     ended()
     (message,) = messages(heard)
-    assert (message["event"], message["text"]) == ("job", f"sim: goto {state}")
+    assert (message["event"], message["job"]["kind"], message["job"]["state"]) == ("job", "goto", state)
     assert (message["job"]["error"] is None) == (state == "done")
+    why = "" if state == "done" else " The table cannot rotate from"
+    assert message["text"].startswith(f"sim: goto {state}.{why}")
+
+
+def test_command_hears_the_answer_of_a_search(tmp_path):
+    heard = tmp_path / "heard"
+    settings = [
+        f"notify_command={json.dumps([sys.executable, '-c', COPY, str(heard)])}",
+        f'state_dir="{tmp_path}"',
+        f'catalog.path="{tmp_path}/catalog"',
+        'bench.sim.object="lamp"',
+    ]
+    options = ["--bench", "sim", "--seed", "1", *(word for one in settings for word in ("--set", one))]
+    for command in (["enroll", "lamp", "--views", "6"], ["identify"]):
+        assert CliRunner().invoke(app, [*command, *options]).exit_code == 0
+    ended()
+    enrolled, found = messages(heard)
+    assert enrolled["text"].startswith("sim: enroll done. lamp: 6 views enrolled")
+    assert found["text"].startswith("sim: identify done. lamp (looks the same from all sides)")
+    assert "\n" not in found["text"]
+    assert found["job"]["result"]["name"] == "lamp"
