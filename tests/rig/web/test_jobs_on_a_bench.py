@@ -17,6 +17,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound, StateNotStored
 from rig.devices.servo import ServoState
 from rig.doctor.examination import run_checks
+from rig.motion.arrival import QUIET_COUNTS
 from rig.safety.saved_state import SERVER_FOLDER, SESSION
 from rig.safety.stop_channel import StopAnswer, StopRequest
 from rig.web.requests import GotoRequest, JobRequest
@@ -24,6 +25,9 @@ from rig.web.setup import Listening, Setup
 from rig.web.work import JOBS
 from tests.rig.calibrations.test_calibrations import RESULT
 from tests.rig.web.conftest import Served, connected
+
+AT_REST_DEG = QUIET_COUNTS * 360 / 4096
+"""Angle by which two readings of a table at rest may differ."""
 
 
 @dataclass
@@ -213,11 +217,11 @@ def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
     assert served.run(kind="reference")["error"]["code"] == 200
     assert served.run(kind="reference", revolutions=5)["error"]["code"] == 200  # beyond the cable budget
     assert served.run(kind="reference", revolutions=-1)["state"] == "done"
-    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(rest_deg - 360, abs=0.1)
+    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(rest_deg - 360, abs=AT_REST_DEG)
     assert served.run(kind="reference", revolutions=0)["state"] == "done"
-    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(rest_deg, abs=0.1)
+    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(rest_deg, abs=AT_REST_DEG)
     assert served.run(kind="reference", here=True)["state"] == "done"
-    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(0, abs=0.1)
+    assert served.client.get("/api/v1/status").json()["table_deg"] == pytest.approx(0, abs=AT_REST_DEG)
 
 
 def test_calibrations_are_offered_and_others_rejected(serve):
