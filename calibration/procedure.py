@@ -210,8 +210,7 @@ def returning(table: Turntable) -> Iterator[Callable[[float], Move]]:
     The table also returns when the generator around the block is closed. After an error or an interruption nothing
     moves: the table stays where it stopped, without torque.
     """
-    low_deg, high_deg = table.limits_deg
-    start_deg = min(max(table.rest_deg, low_deg), high_deg)
+    start_deg = table.return_deg
 
     def go_back() -> None:
         table.goto(start_deg)

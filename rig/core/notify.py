@@ -29,6 +29,12 @@ def notify(command: Sequence[str], message: Mapping[str, Any]) -> None:
         _last[0].start()
 
 
+def notify_of_job(command: Sequence[str], bench: str, kind: str, words: str, job: Mapping[str, Any]) -> None:
+    """Tell a command how a job ended. The first line of ``words`` is the answer, or the reason of a failure."""
+    text = f"{bench}: {kind} {job['state']}. {words}".partition("\n")[0].strip()
+    notify(command, {"event": "job", "bench": bench, "text": text, "job": job})
+
+
 def print_note(text: str) -> None:
     """Print a note on stderr, from any thread, unless it is closed."""
     with suppress(OSError):

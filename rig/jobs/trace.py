@@ -59,7 +59,7 @@ def record(desk: Desk, *, still: bool = False, adapter: Mapping[str, Any] | None
 def _rotate(bench: Bench) -> Steps[None]:
     """Rotate the table a little, interrupt one motion, and come back."""
     with Turntable(bench, trust_gyro=not isinstance(bench.imu, _NoImu)) as table:
-        start_deg = table.rest_deg
+        start_deg = table.return_deg
         side = 1.0 if start_deg + REACH_DEG <= table.limits_deg[1] else -1.0
         for number, step_deg in enumerate(STEPS_DEG):
             yield moved(number, (yield from announced(number, table, start_deg + side * step_deg)))

@@ -68,7 +68,7 @@ def equivalent_within(target_deg: float, rest_deg: float, limits_deg: tuple[floa
     return min(angles_deg, key=lambda angle_deg: abs(angle_deg - rest_deg), default=None)
 
 
-SETTLING_MS, SHAPED_MS = 220.0, 120.0
+SETTLING_MS, SHAPED_MS = 170.0, 120.0
 """Time of a move for ringing and for the bus; before and after it, the table is quiet for ``table.quiet_s``. The second
 is that of a shaped move (`rig.motion.shaper`), which takes longer itself."""
 FRAMES: Final = 1.5

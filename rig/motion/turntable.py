@@ -162,6 +162,12 @@ class Turntable(AbstractContextManager["Turntable"]):
         return self._rest_deg
 
     @property
+    def return_deg(self) -> float:
+        """Target to come back to the last rest: friction may hold the table a bit beyond a limit of the cable."""
+        low_deg, high_deg = self.limits_deg
+        return min(max(self._rest_deg, low_deg), high_deg)
+
+    @property
     def limits_deg(self) -> tuple[float, float]:
         """The cable budget: lowest and highest table angle."""
         return self._config.limits_deg

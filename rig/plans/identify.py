@@ -414,7 +414,7 @@ def watch(
     Raises `RigError`: as `identify`, except for `NoObject` and `ViewRejected`.
     """
     with Turntable(bench) as table:
-        home_deg = table.rest_deg
+        home_deg = table.return_deg
     reason = WaitReason.FIRST_OBJECT
     while True:
         yield Waiting(reason)

@@ -118,8 +118,7 @@ def _two_frames(bench: Bench, *, anyway: bool) -> Generator[Event, None, _Taken]
     rotated = None
     with Turntable(bench) as table:
         move = table.hold()
-        low_deg, high_deg = table.limits_deg
-        start_deg = min(max(table.rest_deg, low_deg), high_deg)  # friction may hold the table a bit beyond its limit
+        start_deg = table.return_deg
         first = yield from capture(0, viewer, table, move.settled_ns)
         target_deg = _rotated_deg(start_deg, table.limits_deg)
         if abs(target_deg - start_deg) >= MIN_ROTATION_DEG:

@@ -20,7 +20,7 @@ from rig.config import RigConfig
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, JobNotFound, RigError
 from rig.core.json_form import plain
-from rig.core.notify import notify
+from rig.core.notify import notify_of_job
 from rig.devices.servo import ServoState
 from rig.jobs.status import bench_facts
 from rig.motion.traces import stored
@@ -246,12 +246,9 @@ class BenchWorker:
             self._error = error
             self.close()
         self.queue.end(job, state, error)
-        bench = self.setup.bench
-        why = job.result_text if job.error is None else job.error.detail
-        text = f"{bench}: {job.request.kind} {job.state}. {why}".partition("\n")[0].strip()
-        notify(
-            self.setup.config.notify_command,
-            {"event": "job", "bench": bench, "text": text, "job": job.model_dump(mode="json")},
+        words = job.result_text if job.error is None else job.error.detail
+        notify_of_job(
+            self.setup.config.notify_command, self.setup.bench, job.request.kind, words, job.model_dump(mode="json")
         )
         self._jobs_ended[state.value] += 1
         self._read_status()

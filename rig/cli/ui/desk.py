@@ -17,7 +17,7 @@ from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
 from rig.core.next_steps import in_words
-from rig.core.notify import notify, print_note
+from rig.core.notify import notify_of_job, print_note
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Enrolled, Event, Identified, event_dict
 from rig.events.wording import line
@@ -117,6 +117,4 @@ class CommandDesk(Desk):
             steps.close()
             if self.config.notify_command:
                 job = {"kind": kind, "state": state, "error": failure, "result": result}
-                bench = self._settings.bench_name
-                words = f"{bench}: {kind} {state}. {text}".partition("\n")[0].strip()
-                notify(self.config.notify_command, {"event": "job", "bench": bench, "text": words, "job": job})
+                notify_of_job(self.config.notify_command, self._settings.bench_name, kind, text, job)

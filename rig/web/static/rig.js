@@ -411,7 +411,7 @@ export function jobTitle(job) {
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
 }
 
-// While a list of jobs is on its way, events may tell newer states than its answer has.
+// While a list of jobs is on its way, events may tell newer states than its answer has, and new jobs.
 const loads = new Set();
 on("job", (job) => loads.forEach((jobs) => jobs.set(job.id, job)));
 
@@ -420,7 +420,9 @@ async function loadJobs(query = "limit=50") {
   loads.add(newer);
   try {
     const { items } = await get(`/jobs?${query}`);
-    return items.map((job) => newer.get(job.id) || job);
+    const listed = items.map(({ id }) => id);
+    const others = [...newer.values()].filter(({ id }) => !listed.includes(id)).reverse();
+    return [...others, ...items.map((job) => newer.get(job.id) || job)];
   } finally {
     loads.delete(newer);
   }
@@ -451,8 +453,8 @@ on("job", (job) => {
   if (job.state === "proposed" || proposed.delete(job.id)) showProposals();
 });
 on("hello", () => act(async () => {
-  proposed.clear();
   const jobs = await loadJobs("state=proposed");
+  proposed.clear();
   for (const job of jobs.reverse()) if (job.state === "proposed") proposed.set(job.id, job);
   showProposals();
 }));
