@@ -52,7 +52,7 @@ def walk_through() -> str:
 
 def test_walk_through_shows_the_real_output(tmp_path, monkeypatch):
     own_folders(tmp_path, monkeypatch)
-    assert blocks("console") == [walk_through()], "write it again: python tests/test_readme.py"
+    assert blocks("console") == [walk_through()], "write it again: python -m tests.test_readme"
 
 
 def test_library_example_finds_the_object(tmp_path):

@@ -1,5 +1,6 @@
 """Every golden session prints what is stored."""
 
+import platform
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ def others(for_all_workers: Path) -> Path:
     return folder
 
 
+# `tests/__init__.py` makes the digits the same on every processor of one kind, not of all kinds.
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the stored digits are those of x86-64")
 @pytest.mark.timeout(600)  # a session in motion computes half a minute, and several on a busy computer
 @pytest.mark.parametrize("name", sessions())
 def test_session_prints_what_is_stored(name: str, others: Path, tmp_path: Path) -> None:
