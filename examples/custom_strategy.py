@@ -5,15 +5,8 @@ import tempfile
 import hbr
 from rig import Catalog, enroll, identify, load_model, open_bench
 from rig.events.events import Identified
-from rig.search.strategies import (
-    AnyStrategy,
-    DenseSearchState,
-    Finish,
-    Rotate,
-    SearchState,
-    descriptor_for,
-    end_by_margin,
-)
+from rig.search.session import AnyStrategy, DenseSearch, Finish, HoughSearch, Rotate
+from rig.search.strategies import descriptor_for, end_by_margin
 from rig.views.description import BENCH_DESCRIPTOR
 from sim.bench import ShelfOperator
 
@@ -25,8 +18,8 @@ class Golden:
 
     name = "golden"
 
-    def next(self, state: SearchState) -> Rotate | Finish:
-        return end_by_margin(state) or Rotate(137.508, note="the golden angle leads far from all views so far")
+    def next(self, search: HoughSearch) -> Rotate | Finish:
+        return end_by_margin(search) or Rotate(137.508, note="the golden angle leads far from all views so far")
 
 
 class FarSide:
@@ -35,9 +28,9 @@ class FarSide:
     name = "far-side"
     descriptor = BENCH_DESCRIPTOR
 
-    def next(self, state: DenseSearchState) -> Rotate | Finish:
-        if state.decision.outcome is not hbr.Outcome.CONTINUE:
-            return Finish(state.decision.reason)
+    def next(self, search: DenseSearch) -> Rotate | Finish:
+        if search.decision.outcome is not hbr.Outcome.CONTINUE:
+            return Finish(search.decision.reason)
         return Rotate(135.0, note="nearly the far side")
 
 

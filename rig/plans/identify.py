@@ -55,8 +55,7 @@ from rig.motion.scan_speed import can_fly, require_camera_time, scan_speed
 from rig.motion.turntable import Turntable
 from rig.plans.steps import ObjectCheck, accepted, announced, capture, check_camera, moved, warn_of_table
 from rig.search.model import Model, begin_search, empty_table_for
-from rig.search.session import SHOWN, Search
-from rig.search.strategies import AnyStrategy, Finish, Rotate
+from rig.search.session import SHOWN, AnyStrategy, Finish, Rotate, Search
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
 from rig.views.empty_table import empty_table_status

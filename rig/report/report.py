@@ -119,9 +119,9 @@ def run_report(saved: SavedRun) -> str:
         answer = record.answer
         found = "no answer" if answer is None else outcome_words(answer)
         meta = Meta(
-            conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
-            wall_clock={"software": about["software"]},
-            date=datetime.fromisoformat(about["started_utc"]),
+            conditions={"bench": about.bench, **record.conditions, "devices": about.devices},
+            wall_clock={"software": about.software},
+            date=about.started_utc,
         )
         return render_report(f"Search: {found}", _answer(record), [], [record], meta=meta)
 

@@ -25,8 +25,8 @@ from rig.config import RigConfig
 from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
-from rig.search.session import SHOWN, DenseSearch, EnrolledViews, HoughSearch, PoseSearch, Search
-from rig.search.strategies import AnyStrategy, descriptor_for, has_poses, is_in_motion, strategy_for
+from rig.search.session import SHOWN, AnyStrategy, DenseSearch, EnrolledViews, HoughSearch, PoseSearch, Search
+from rig.search.strategies import descriptor_for, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR, DENSE_DESCRIPTORS
 from rig.views.empty_table import empty_table_status
@@ -103,16 +103,14 @@ def begin_search(
             next_step=f"Load it with rig.search.model.load_model(catalog, descriptor={wanted!r}), or use another "
             "strategy.",
         )
+    common = model.views, config, chosen, seed, top
     if isinstance(model.index, hbr.ViewIndex):
-        if has_poses(chosen):
-            return PoseSearch(_poses(model.views), config, chosen, seed=seed, top=top)
-        index = _tree(model.views) if config.identify.index == "tree" else model.index
-        return HoughSearch(index, config, chosen, seed=seed, top=top)
-    if is_in_motion(chosen):
-        session: hbr.DenseSession = ArcSession(model.index)
-    else:
-        session = hbr.DenseSession(model.index, max_views=config.identify.max_views)
-    return DenseSearch(session, model.views, config, chosen, seed=seed, top=top)
+        if getattr(chosen, "poses", False):
+            return PoseSearch(*common, _poses(model.views))
+        return HoughSearch(*common, _tree(model.views) if config.identify.index == "tree" else model.index)
+    if getattr(chosen, "in_motion", False):
+        return DenseSearch(*common, ArcSession(model.index))
+    return DenseSearch(*common, hbr.DenseSession(model.index, max_views=config.identify.max_views))
 
 
 def load_model(

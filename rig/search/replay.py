@@ -22,8 +22,7 @@ from rig.events.events import (
 )
 from rig.search.model import begin_search
 from rig.search.saved_run import SavedRun
-from rig.search.session import Search
-from rig.search.strategies import Finish
+from rig.search.session import Finish, Search
 from rig.views.description import SearchDescriber
 
 TOLERANCE: Final = 1e-9

@@ -11,22 +11,21 @@ import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from importlib.metadata import version
+from importlib.metadata import version as version_of
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self, TextIO
+from typing import Any, Final, Literal, Self, TextIO
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 import hbr
 from hbr.core.arrays import MIN_SIDE_PX
-from hbr.descriptors import Descriptor, descriptor
+from hbr.descriptors import descriptor
 from rig.bench import Bench
 from rig.config import RigConfig
-from rig.config.values import validate
 from rig.core.errors import CatalogError, Problem, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.core.json_form import plain
@@ -50,6 +49,30 @@ _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, Arithmetic
 _PROBLEM: Final = TypeAdapter(Problem)
 
 
+class DescriptorUsed(BaseModel):
+    """The descriptor of a run's views, and its version."""
+
+    name: str
+    version: int
+
+
+class About(BaseModel):
+    """What ``run.json`` contains: how the run was made."""
+
+    model_config = ConfigDict(frozen=True)
+
+    format: Literal["hbr-rig run"] = FORMAT
+    version: int = VERSION
+    software: str
+    started_utc: AwareDatetime
+    bench: str
+    devices: dict[str, Any]
+    conditions: dict[str, Any]
+    findings: list[Any]
+    descriptor: DescriptorUsed
+    config: RigConfig
+
+
 class RunWriter:
     """Stores one search while it runs: after an interruption the folder contains all events so far."""
 
@@ -65,19 +88,18 @@ class RunWriter:
             empty_table, _ = empty_table_for(bench, model)
             if empty_table is not None:
                 write(folder / EMPTY_TABLE, images.encode(empty_table))
-            about = {
-                "format": FORMAT,
-                "version": VERSION,
-                "software": f"hbr-rig {version('hbr-rig')}",
-                "started_utc": bench.clock.utc().isoformat(),
-                "bench": bench.name,
-                "devices": bench.devices(),
-                "conditions": dict(bench.conditions),
-                "findings": list(bench.findings),
-                "descriptor": {"name": kind.name, "version": kind.version},
-                "config": (config or bench.config).model_dump(mode="json", exclude={"serve"}),  # tokens
-            }
-            write(folder / "run.json", (json.dumps(about, indent=2, default=str) + "\n").encode())
+            about = About(
+                software=f"hbr-rig {version_of('hbr-rig')}",
+                started_utc=bench.clock.utc(),
+                bench=bench.name,
+                devices=plain(bench.devices()),
+                conditions=plain(bench.conditions),
+                findings=plain(bench.findings),
+                descriptor=DescriptorUsed(name=kind.name, version=kind.version),
+                config=config or bench.config,
+            )
+            text = about.model_dump_json(indent=2, exclude={"config": {"serve"}})  # it has the tokens
+            write(folder / "run.json", f"{text}\n".encode())
             self._events: TextIO = (folder / "events.jsonl").open("x", encoding="utf-8")
 
     def __enter__(self) -> Self:
@@ -134,9 +156,7 @@ class SavedRun:
     """The content of a saved run."""
 
     folder: Path
-    about: dict[str, Any]
-    """Bench, devices, conditions and software, as JSON values."""
-    config: RigConfig
+    about: About
     model: Model
     empty_table: NDArray[np.uint8] | None
     """The sheet of empty-table images, uint8 (H, W, 3) (`rig.views.table_sheet`)."""
@@ -145,6 +165,11 @@ class SavedRun:
     is_cut: bool
     """Whether the last line of the events was cut off while it was written."""
     _lines: tuple[dict[str, Any], ...]
+
+    @property
+    def config(self) -> RigConfig:
+        """The settings of the search."""
+        return self.about.config
 
     @property
     def views(self) -> hbr.Views:
@@ -200,24 +225,19 @@ def load_run(folder: Path) -> SavedRun:
     Raises `UsageError`: the folder contains no run, a damaged run, or one of another version of the program.
     """
     try:
-        about = _object(_bytes(folder, "run.json"), "run.json")
-        if about.get("format") != FORMAT:
-            raise ValueError("run.json does not belong to a saved run")
-        if about["version"] != VERSION:
+        values = _object(_bytes(folder, "run.json"), "run.json")
+        if values.get("format") == FORMAT and (number := values.get("version")) != VERSION:
             raise UsageError(
-                f"Another version of the program saved the run {folder}: it has the format version "
-                f"{about['version']}, this program reads {VERSION}.",
+                f"Another version of the program saved the run {folder}: it has the format version {number}, this "
+                f"program reads {VERSION}.",
                 next_step="Use the version of hbr-rig that saved it.",
             )
-        if not all(isinstance(about[key], str) for key in ("bench", "software", "started_utc")):
-            raise TypeError("bench, software or started_utc in run.json is not text")
-        if not isinstance(about["devices"], dict):
-            raise TypeError("devices in run.json is not an object")
+        about = About.model_validate(values)
         # The model: the enrolled views of the day.
-        kind = _descriptor(about["descriptor"])
-        config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
-        views = _views((_object(line) for line in _lines(_bytes(folder, "model.jsonl"))), kind.name)
-        model = model_of(views)
+        used = about.descriptor
+        if used.version != descriptor(used.name).version:
+            raise ValueError(f"it was described by {used.name} {used.version}, which this program does not have")
+        model = model_of(_views((_object(line) for line in _lines(_bytes(folder, "model.jsonl"))), used.name))
         empty_table = _image(folder, EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
         # The events: a power cut may have cut off the last line.
         content = _bytes(folder, "events.jsonl")
@@ -225,13 +245,11 @@ def load_run(folder: Path) -> SavedRun:
         lines = [_object(line) for line in _lines(content)[: -1 if is_cut else None]]
         has_failed = bool(lines) and "event" not in lines[-1]
         failed = _PROBLEM.validate_python(lines.pop()) if has_failed else None
-    except ValidationError as error:
-        raise _damaged(folder, "the last line of events.jsonl is neither an event nor an error") from error
     except CatalogError as error:
         raise _damaged(folder, f"{error.what.rstrip('.')}: {error.evidence['reason']}") from error
     except _DAMAGE as error:
         raise _damaged(folder, _reason(error)) from error
-    return SavedRun(folder, about, config, model, empty_table, failed, is_cut, tuple(lines))
+    return SavedRun(folder, about, model, empty_table, failed, is_cut, tuple(lines))
 
 
 def _frame_file(index: int) -> str:
@@ -261,14 +279,6 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
         for line in lines
     ]
     return hbr.Views.concatenate(parts) if parts else hbr.Views.empty(kind)
-
-
-def _descriptor(used: dict[str, Any]) -> Descriptor:
-    name, number = used["name"], used["version"]
-    kind = descriptor(name)
-    if number != kind.version:
-        raise ValueError(f"it was described by {name} {number}, which this program does not have")
-    return kind
 
 
 def _image(folder: Path, name: str) -> NDArray[np.uint8]:
@@ -307,6 +317,9 @@ def _bytes(folder: Path, name: str) -> bytes:
 
 def _reason(error: Exception) -> str:
     """Return an error in words; of Python's own errors, only those of a ValueError or TypeError are useful."""
+    if isinstance(error, ValidationError):
+        first = error.errors(include_url=False)[0]
+        return short(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", MAX_REASON)
     text = str(error) if isinstance(error, ValueError | TypeError) else "a value is missing, or it has the wrong kind"
     return short(text, MAX_REASON)
 

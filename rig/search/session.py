@@ -3,15 +3,15 @@
 A search does no I/O. It takes a view (`Search.add`), asks for enrolled views to compare it with (`Search.verify`), and
 says what it needs next (`Search.decide`): a view after a rotation, or the end. Then it answers (`Search.answer`). The
 bench at rest and in motion (`rig.plans.identify`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the
-same `hbr.DenseSession`.
+same `hbr.DenseSession`. Which rotation comes next, and when the search ends, a `Strategy` decides from the search.
 
 Decision: docs/decisions/0017.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any, Final
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,16 +39,7 @@ from rig.events.events import (
     Rejected,
     RotationReason,
     Verified,
-)
-from rig.search.strategies import (
-    DenseSearchState,
-    Finish,
-    PoseSearchState,
-    Rotate,
-    SearchState,
-    Strategy,
-    reachable_arcs,
-    reachable_rotations,
+    Weighed,
 )
 from rig.views.capture import RejectReason
 from rig.views.description import DescribedView
@@ -64,33 +55,109 @@ Hypotheses = Sequence[Sequence[hbr.Segmentation]]
 """All segmentations of each view of a search, the likeliest first (`rig.views.description.SearchDescriber`)."""
 
 
-class Search(ABC):
-    """One search for an object; `rig.search.model.begin_search` makes it.
+@dataclass(frozen=True, slots=True)
+class Rotate:
+    """Take the next view after a rotation of the camera around the object, positive to the left.
 
-    Views can be added after its end, too: a replay adds all views of a run. Queries need its ``descriptor``; ``names``
-    are those of the enrolled objects.
+    ``note`` is the reason, for a strategy that does not come with the rig. ``s_left`` and ``s_right`` are the
+    similarities of the ``candidates`` (names) from each side, if the strategy compared the sides; ``weighed`` has all
+    rotations that it weighed.
     """
 
-    in_motion = False
-    """Whether the frames of a rotation are its views."""
-    ranked: Ranked
-    """The candidates after the last view that was decided on."""
-    step: Rotate | Finish | None = None
-    """The strategy's last decision."""
-    is_new_decision = True
-    """Whether the last view led to a decision; between the decisions of a search in motion the last one stays."""
+    rotation_deg: float
+    reason: RotationReason = RotationReason.CUSTOM
+    note: str = ""
+    s_left: float | None = None
+    s_right: float | None = None
+    candidates: tuple[str, ...] = ()
+    weighed: Weighed | None = None
 
-    def __init__(self, views: hbr.Views, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
-        self.descriptor = views.descriptor
-        self.names = views.object_names
-        self.strategy = strategy
-        self._config = config
-        self._top = top
-        self._rng = np.random.default_rng(seed)
-        self._orientations: list[float] = []
-        self._table_deg = 0.0
-        self._disturbed = False
-        self._is_decided = True
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """End the search. ``note`` is the reason, for a strategy that does not come with the rig."""
+
+    reason: hbr.StopReason = hbr.StopReason.CUSTOM
+    note: str = ""
+
+
+Searched = TypeVar("Searched", bound="Search", contravariant=True)
+
+
+class Strategy(Protocol[Searched]):
+    """Decides after each view.
+
+    A strategy of the dense search also has the attribute ``descriptor``: that of its views. With the
+    attribute ``in_motion`` it chooses arcs, on which every frame is a view. A strategy of the hidden Markov model has
+    the attribute ``poses``, which is true.
+    """
+
+    @property
+    def name(self) -> str:
+        """The name that selects it, and that a saved run stores."""
+        ...
+
+    def next(self, search: Searched) -> Rotate | Finish:
+        """Return the rotation to the next view, or the end. It only reads the search, and draws from its ``rng``.
+
+        The same search and draws give the same answer.
+        """
+        ...
+
+
+AnyStrategy = Strategy[Any]
+
+
+@dataclass(eq=False)
+class Search(ABC):
+    """One search for an object; `rig.search.model.begin_search` makes it, and its strategy reads it.
+
+    Views can be added after its end, too: a replay adds all views of a run.
+    """
+
+    enrolled: hbr.Views
+    config: RigConfig
+    strategy: AnyStrategy
+    seed: int
+    top: int
+    """How many candidates an event names."""
+    in_motion: bool = field(default=False, init=False)
+    """Whether the frames of a rotation are its views."""
+    ranked: Ranked = field(init=False)
+    """The candidates after the last view that was decided on."""
+    step: Rotate | Finish | None = field(default=None, init=False)
+    """The strategy's last decision."""
+    is_new_decision: bool = field(default=True, init=False)
+    """Whether the last view led to a decision; between the decisions of a search in motion the last one stays."""
+    table_deg: float = field(default=0.0, init=False)
+    """Table angle of the last view, unwrapped."""
+    rng: np.random.Generator = field(init=False)
+    _orientations: list[float] = field(default_factory=list, init=False)
+    _disturbed: bool = field(default=False, init=False)
+    _is_decided: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+
+    @property
+    def descriptor(self) -> str:
+        """The descriptor of the enrolled views, which queries need."""
+        return self.enrolled.descriptor
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the enrolled objects."""
+        return self.enrolled.object_names
+
+    @property
+    def views(self) -> int:
+        """The number of views so far."""
+        return len(self._orientations)
+
+    @property
+    def score(self) -> float:
+        """The score of the leading candidate, per view."""
+        return self.ranked.candidates[0].score
 
     def notice(self, event: Event) -> None:
         """Take an event that precedes the next view: the table may have moved without a command, as if by hand."""
@@ -109,7 +176,7 @@ class Search(ABC):
         The table angle is unwrapped.
         """
         self._orientations.append(azimuth_deg)
-        self._table_deg = table_deg
+        self.table_deg = table_deg
         self._add(view)
         self._disturbed = self._is_decided = False
 
@@ -119,7 +186,7 @@ class Search(ABC):
             self._is_decided = True
             self.ranked = self._rank()
             if self.is_new_decision:
-                self.step = self.strategy.next(self._state(self._table_deg))
+                self.step = self.strategy.next(self)
         assert self.step is not None
         return self.ranked, self.step
 
@@ -128,9 +195,6 @@ class Search(ABC):
 
     @abstractmethod
     def _rank(self) -> Ranked: ...
-
-    @abstractmethod
-    def _state(self, table_deg: float) -> SearchState | PoseSearchState | DenseSearchState: ...
 
     def decided(self, number: int, target_deg: float) -> Decided:
         """Return the event of the last decision, a rotation of the table to ``target_deg``."""
@@ -143,7 +207,7 @@ class Search(ABC):
             target_deg=target_deg,
             s_left=step.s_left,
             s_right=step.s_right,
-            candidates=step.candidates[: self._top],
+            candidates=step.candidates[: self.top],
             reason=RotationReason(step.reason),
             note=step.note,
             weighed=step.weighed,
@@ -174,7 +238,7 @@ class Search(ABC):
             pose_deg=best.pose_deg,
             yaw_deg=(yaw_deg := float(wrap360(self._orientations[-1] - best.pose_deg))),
             yaw_set_deg=(yaw_deg,),
-            views=len(self._orientations),
+            views=self.views,
             travelled_deg=travelled_deg,
             seconds=seconds,
             reason=end.reason,
@@ -188,21 +252,24 @@ def _no_step() -> Asking[None]:
     yield from ()
 
 
-class _PaperSearch(Search):
+@dataclass(eq=False)
+class PaperSearch(Search):
     """A search of the paper or of its successor: a score per view tells whether the object is unknown."""
 
-    def __init__(self, views: hbr.Views, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
-        super().__init__(views, config, strategy, seed=seed, top=top)
-        self._views = views
-        given, repeatability = config.identify.min_score, config.identify.repeatability
-        self._min_score = hbr.open_set_threshold(views, repeatability=repeatability) if given is None else given
+    min_score: float = field(init=False)
+    """Below this score per view the object is unknown."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given, repeatability = self.config.identify.min_score, self.config.identify.repeatability
+        self.min_score = hbr.open_set_threshold(self.enrolled, repeatability=repeatability) if given is None else given
 
     def _by_score(self, answer: Identified, possible: Sequence[str], object_index: int, **others: Any) -> Identified:
         """Return the answer by its score and its possible objects, with all rotations by the measured symmetry."""
         outcome = hbr.Outcome.FOUND if len(possible) == 1 else hbr.Outcome.AMBIGUOUS
-        if answer.score < self._min_score:
+        if answer.score < self.min_score:
             outcome, possible = hbr.Outcome.UNKNOWN, ()
-        own = symmetry(self._views, object_index)
+        own = symmetry(self.enrolled, object_index)
         period_deg = own.period_deg if own else None
         poses = round(360 / period_deg) if period_deg else 1 if period_deg is None else 0
         yaw_deg = answer.yaw_set_deg[0]
@@ -211,7 +278,7 @@ class _PaperSearch(Search):
             name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
             outcome=outcome,
             possible=tuple(possible),
-            min_score=self._min_score,
+            min_score=self.min_score,
             yaw_deg=yaw_deg if poses == 1 else None,
             yaw_set_deg=tuple(wrap360(yaw_deg + k * 360 / poses) for k in range(poses)),
             period_deg=period_deg,
@@ -219,26 +286,28 @@ class _PaperSearch(Search):
         )
 
 
-class HoughSearch(_PaperSearch):
+@dataclass(eq=False)
+class HoughSearch(PaperSearch):
     """The paper's search: views vote by lists of the most similar enrolled views (`hbr.retrieve`)."""
 
-    def __init__(
-        self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int
-    ) -> None:
-        super().__init__(index.views, config, strategy, seed=seed, top=top)
-        self._index = index
-        self._descriptors: list[NDArray[np.uint8]] = []
+    index: hbr.ViewIndex
+    """The enrolled views."""
+    queries: NDArray[np.uint8] = field(init=False)
+    """Descriptors of the views so far, in their order, uint8 (N, 144)."""
+    ranking: hbr.Ranking = field(init=False)
+    """The objects by their scores; `ranking.orientation_deg` has the orientation of each view."""
+    _descriptors: list[NDArray[np.uint8]] = field(default_factory=list, init=False)
 
     def _add(self, view: DescribedView) -> None:
         self._descriptors.append(view.levels[self.descriptor])
 
     def _rank(self) -> Ranked:
-        self._queries = queries = np.array(self._descriptors)
-        config = self._config.identify
-        self._ranking = ranking = hbr.retrieve(
+        self.queries = queries = np.array(self._descriptors)
+        config = self.config.identify
+        self.ranking = ranking = hbr.retrieve(
             queries,
             np.array(self._orientations),
-            self._index,
+            self.index,
             omega=config.omega,
             list_length=config.list_length,
             extension=config.extension,
@@ -246,36 +315,23 @@ class HoughSearch(_PaperSearch):
         views = len(queries)
         candidates = tuple(
             Candidate(name, float(score) / views, float(pose_deg))
-            for name, score, pose_deg in zip(ranking.names[: self._top], ranking.scores, ranking.pose_deg, strict=False)
+            for name, score, pose_deg in zip(ranking.names[: self.top], ranking.scores, ranking.pose_deg, strict=False)
         )
         return Ranked(views - 1, candidates, hbr.score_margin(ranking, queries) / views)
-
-    def _state(self, table_deg: float) -> SearchState:
-        return SearchState(
-            index=self._index,
-            queries=self._queries,
-            ranking=self._ranking,
-            score=self.ranked.candidates[0].score,
-            margin=self.ranked.margin,
-            min_score=self._min_score,
-            table_deg=table_deg,
-            limits_deg=self._config.table.limits_deg,
-            config=self._config.identify,
-            rng=self._rng,
-        )
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
         possible = answer.possible
-        if answer.margin <= 0 and len(self._ranking.names) > 1:
+        if answer.margin <= 0 and len(self.ranking.names) > 1:
             # Objects that share the best score; at least the second one, which is as likely by the margin.
-            scores = self._ranking.scores
-            possible = self._ranking.names[: max(2, int((scores >= scores[0]).sum()))]
-        first = int(self._ranking.object_index[0])
-        return self._by_score(answer, possible, first, min_margin=self._config.identify.margin)
+            scores = self.ranking.scores
+            possible = self.ranking.names[: max(2, int((scores >= scores[0]).sum()))]
+        first = int(self.ranking.object_index[0])
+        return self._by_score(answer, possible, first, min_margin=self.config.identify.margin)
 
 
-class PoseSearch(_PaperSearch):
+@dataclass(eq=False)
+class PoseSearch(PaperSearch):
     """The search of the paper's successor: a hidden Markov model over the poses of all objects (`hbr.paper.hmm`).
 
     The probabilities are shares among the enrolled objects, because the model knows no other. Whether the object is
@@ -283,24 +339,29 @@ class PoseSearch(_PaperSearch):
     orientations: the similarity to the most similar view of the object, averaged over the views so far.
     """
 
-    _belief: PoseBelief
+    model: PoseModel
+    belief: PoseBelief = field(init=False)
+    """The probabilities of all poses, with its method ``next_view``."""
 
-    def __init__(self, model: PoseModel, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
-        super().__init__(model.views, config, strategy, seed=seed, top=top)
-        self._so_far: PoseModel | PoseBelief = model
-        self._compared = model.compared
-        self._rows, _ = model.views.by_object
-        self._begin = model.begin
-        self._with_views = model.views.object_index[self._rows[model.begin]]
-        self._reach = np.zeros(len(model.begin))
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._so_far: PoseModel | PoseBelief = self.model
+        self._rows, _ = self.enrolled.by_object
+        self._with_views = self.enrolled.object_index[self._rows[self.model.begin]]
+        self._reach = np.zeros(len(self.model.begin))
+
+    @property
+    def probability(self) -> float:
+        """The probability of the leading candidate."""
+        return float(self._probability[0])
 
     def _add(self, view: DescribedView) -> None:
-        similar = self._compared.similarity(view.levels[self.descriptor][None])[0]
-        self._so_far = self._belief = update_poses(similar, self._orientations[-1], self._so_far)
-        self._reach += np.maximum.reduceat(similar[self._rows], self._begin)
+        similar = self.model.compared.similarity(view.levels[self.descriptor][None])[0]
+        self._so_far = self.belief = update_poses(similar, self._orientations[-1], self._so_far)
+        self._reach += np.maximum.reduceat(similar[self._rows], self.model.begin)
 
     def _rank(self) -> Ranked:
-        self._objects, log_probability, poses_deg = self._belief.ranking()
+        self._objects, log_probability, poses_deg = self.belief.ranking()
         self._probability = np.exp(log_probability)
         # The scores, of the objects in the order of their probabilities.
         views = len(self._orientations)
@@ -308,19 +369,7 @@ class PoseSearch(_PaperSearch):
         numbers = zip(*(each.tolist() for each in (self._objects, score, poses_deg, self._probability)), strict=True)
         candidates = tuple(Candidate(self.names[j], *rest) for j, *rest in numbers)
         margin = float(score[0] - score[1:].max(initial=0.0))
-        return Ranked(views - 1, candidates[: self._top], margin)
-
-    def _state(self, table_deg: float) -> PoseSearchState:
-        return PoseSearchState(
-            belief=self._belief,
-            probability=float(self._probability[0]),
-            score=self.ranked.candidates[0].score,
-            min_score=self._min_score,
-            rotations_deg=reachable_rotations(self._config, table_deg)[0],
-            table_deg=table_deg,
-            config=self._config.identify,
-            rng=self._rng,
-        )
+        return Ranked(views - 1, candidates[: self.top], margin)
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
@@ -328,31 +377,35 @@ class PoseSearch(_PaperSearch):
         possible = [self.names[j] for j in self._objects[:count].tolist()]
         answer = self._by_score(answer, possible, int(self._objects[0]), min_confidence=CONFIDENT)
         found = answer.outcome is hbr.Outcome.FOUND
-        return replace(answer, confidence=float(self._probability[0]) if found else None)
+        return replace(answer, confidence=self.probability if found else None)
 
 
+@dataclass(eq=False)
 class DenseSearch(Search):
     """The bench's own search: a probability for every object at every azimuth (`hbr.DenseSession`).
 
     In motion (`hbr.dense.arc`), each frame has a weight for its share of new evidence.
     """
 
-    def __init__(
-        self,
-        session: hbr.DenseSession,
-        views: hbr.Views,
-        config: RigConfig,
-        strategy: Strategy[Any],
-        *,
-        seed: int,
-        top: int,
-    ) -> None:
-        super().__init__(views, config, strategy, seed=seed, top=top)
-        self._session = session
-        self.in_motion = isinstance(session, ArcSession)
+    session: hbr.DenseSession
+    """The belief, with its methods to choose a view."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.in_motion = isinstance(self.session, ArcSession)
+
+    @property
+    def views(self) -> int:
+        """The number of views so far that show the present object."""
+        return self.session.belief.queries
+
+    @property
+    def decision(self) -> hbr.StopDecision:
+        """What follows from the views so far."""
+        return self.session.decision
 
     def _add(self, view: DescribedView) -> None:
-        self._session.add(
+        self.session.add(
             view.levels[self.descriptor],
             self._orientations[-1],
             earlier=view.earlier,
@@ -360,21 +413,21 @@ class DenseSearch(Search):
             other_bench=view.other_bench,
             disturbed=self._disturbed,
         )
-        self.is_new_decision = self._session.is_new_decision
+        self.is_new_decision = self.session.is_new_decision
 
     def _rank(self) -> Ranked:
-        belief = self._session.belief
+        belief = self.session.belief
         self._scores = belief.scores()
-        self._order = np.lexsort((-self._scores, -self._session.among_enrolled()))
+        self._order = np.lexsort((-self._scores, -self.session.among_enrolled()))
         candidates = self._candidates()
         others = float(self._scores[self._order[1:]].max(initial=0.0))
-        return Ranked(len(self._orientations) - 1, candidates, candidates[0].score - others, self._session.decision)
+        return Ranked(len(self._orientations) - 1, candidates, candidates[0].score - others, self.decision)
 
     def _candidates(self) -> tuple[Candidate, ...]:
         """Return the leading candidates, the likeliest first, with their shares of the posterior."""
-        belief, probability = self._session.belief, self._probability()
+        belief, probability = self.session.belief, self._probability()
         found = []
-        for place in self._order[: self._top].tolist():
+        for place in self._order[: self.top].tolist():
             one = int(belief.index.object_index[place])
             numbers = float(self._scores[place]), azimuth_of(belief, one), float(probability[place])
             found.append(Candidate(self.names[one], *numbers))
@@ -382,38 +435,22 @@ class DenseSearch(Search):
 
     def _probability(self) -> NDArray[np.float64]:
         """Return the probability of each object considered; what is missing to 1 is that of "not enrolled"."""
-        return self._session.among_enrolled() * (1 - self._session.decision.not_enrolled)
+        return self.session.among_enrolled() * (1 - self.decision.not_enrolled)
 
     def changed(self) -> ObjectChanged | None:
-        change = self._session.change
+        change = self.session.change
         return None if change is None else ObjectChanged(len(self._orientations) - 1, *change)
 
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
-        present = self._session.present
+        present = self.session.present
         name = self.names[present.object_index]
         return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.probability, present.outcome)
 
-    def _state(self, table_deg: float) -> DenseSearchState:
-        if self.in_motion:
-            way = float(np.sign(self.step.rotation_deg)) if isinstance(self.step, Rotate) else 0.0
-            rotations_deg, seconds = reachable_arcs(self._config, table_deg, way)
-        else:
-            rotations_deg, seconds = reachable_rotations(self._config, table_deg)
-        return DenseSearchState(
-            session=self._session,
-            decision=self._session.decision,
-            rotations_deg=rotations_deg,
-            seconds=seconds,
-            table_deg=table_deg,
-            config=self._config.identify,
-            rng=self._rng,
-        )
-
     def verify(self, hypotheses: Hypotheses, measured: PixelFit | None = None) -> Asking[Verified | None]:
-        found = yield from self._session.verify(self._queries(hypotheses), measured)
+        found = yield from self.session.verify(self._queries(hypotheses), measured)
         if found is None:
             return None
-        decision = self._session.decision
+        decision = self.decision
         return Verified(
             index=len(self._orientations) - 1,
             name=self.names[found.object_index],
@@ -428,21 +465,20 @@ class DenseSearch(Search):
         )
 
     def _queries(self, hypotheses: Hypotheses) -> Queries:
-        own, orientations_deg = hypotheses[self._session.left_out :], self._orientations[self._session.left_out :]
+        own, orientations_deg = hypotheses[self.session.left_out :], self._orientations[self.session.left_out :]
         return lambda n: [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
-        decision = self._session.end()
+        decision = self.session.end()
         outcome = decision.outcome
         possible = self._possible(decision)
-        found = pose(self._session.belief, decision.object_index)
+        found = pose(self.session.belief, decision.object_index)
         yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
         return replace(
             answer,
             name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
-            views=self._session.belief.queries,
-            left_out=tuple(LeftOut(n, LeftOutReason.OBJECT_CHANGED) for n in range(self._session.left_out)),
+            left_out=tuple(LeftOut(n, LeftOutReason.OBJECT_CHANGED) for n in range(self.session.left_out)),
             outcome=outcome,
             possible=possible,
             yaw_deg=yaws_deg[0] if len(yaws_deg) == 1 else None,
@@ -465,4 +501,4 @@ class DenseSearch(Search):
         if decision.outcome is hbr.Outcome.AMBIGUOUS:
             together = decision.not_enrolled + np.cumsum(self._probability()[self._order])
             count = max(2, 1 + int((together < decision.min_confidence).sum()))
-        return tuple(self.names[j] for j in self._session.belief.index.object_index[self._order[:count]].tolist())
+        return tuple(self.names[j] for j in self.session.belief.index.object_index[self._order[:count]].tolist())

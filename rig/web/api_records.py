@@ -64,7 +64,7 @@ def add_records(routes: Routes, server: Server) -> None:
         saved = load(name)
         with saved.damage():
             events = [{**event_dict(event), "text": page_line(event)} for event in saved.events()]
-        about = {"started_utc": saved.about["started_utc"], "bench": saved.about["bench"]}
+        about = {"started_utc": saved.about.started_utc.isoformat(), "bench": saved.about.bench}
         return JSONResponse({"name": name, **about, "events": events})
 
     @routes.watch.get("/runs/{name}/report", tags=["runs"], response_class=HTMLResponse)

@@ -41,7 +41,8 @@ from rig.report import (
     write_report,
 )
 from rig.search.model import Model, load_model
-from rig.search.strategies import AnyStrategy, descriptor_for, strategy_for
+from rig.search.session import AnyStrategy
+from rig.search.strategies import descriptor_for, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
 from sim.change import Change

@@ -41,9 +41,8 @@ def replay(
     from rig.events.wording import problem_line
 
     if not settings.json:
-        about = saved.about
-        started = str(about["started_utc"])[:16].replace("T", " ")
-        print(f"Bench {about['bench']}, {started} UTC, {counted(len(saved.views.object_names), 'enrolled object')}")
+        about, objects = saved.about, counted(len(saved.views.object_names), "enrolled object")
+        print(f"Bench {about.bench}, {about.started_utc:%Y-%m-%d %H:%M} UTC, {objects}")
     with saved.damage(), LiveView(settings, plain=True) as view:
         for event in saved.events():
             view.add(event)
@@ -113,7 +112,7 @@ def _check(settings: Settings, saved: "SavedRun") -> None:
         raise ReplayMismatch(
             f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {done}",
             next_step="Check whether the files of the run were changed. If not, this version of the program decides "
-            f"differently from {saved.about['software']}, which saved the run.",
+            f"differently from {saved.about.software}, which saved the run.",
             evidence={"differences": listed},
         )
     if not found.is_complete:

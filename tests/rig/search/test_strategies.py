@@ -13,8 +13,8 @@ from rig.config import IdentifyConfig, RigConfig, TableConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.events.events import Ranked, RotationReason
 from rig.search.model import begin_search, model_of
-from rig.search.session import Search
-from rig.search.strategies import Finish, Rotate, Strategy, strategy
+from rig.search.session import Finish, Rotate, Search, Strategy
+from rig.search.strategies import strategy
 from tests.fuzzing import examples
 from tests.rig.search.views import seen
 
@@ -116,7 +116,7 @@ def test_the_tree_gives_the_same_answers():
         for index in ("flat", "tree"):
             search = searching(known, "ahbr", index=index)
             found.append(added(search, row, 0.0, table_deg=0.0)[0])
-            assert search._index.method == index
+            assert search.index.method == index
         assert found[0] == found[1]
 
 
