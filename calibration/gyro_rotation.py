@@ -67,7 +67,7 @@ def plot(result: CalibrationResult) -> Chart | None:
     largest = [row["stated_deg"] * row["ratio_may_be"][1] for row in rows]
     return Chart(
         "Scatter of a measured rotation by its duration",
-        Axis("duration, s", log=True),
+        Axis("duration, s", span=(0.0,)),
         Axis("σ, °", span=(0.0,)),
         [
             Series("stated", seconds, [row["stated_deg"] for row in rows], MODEL, curve=True),

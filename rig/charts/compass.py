@@ -1,10 +1,11 @@
 """Charts on the circle of azimuths around the table, seen from above: the camera's path, and the table's angle."""
 
-from collections.abc import Collection, Sequence
-from itertools import accumulate
-from math import atan2, ceil, cos, hypot, radians, sin
-from typing import Final, NamedTuple
+from collections.abc import Mapping
+from itertools import accumulate, pairwise
+from math import ceil, cos, radians, sin
+from typing import Final
 
+from hbr.core.angles import wrap180
 from rig.charts import svg
 from rig.charts.svg import Point
 from rig.core.phrases import azimuth_words
@@ -15,11 +16,7 @@ RIM: Final = 160.0  # leaves room for the labels around it
 
 _INNERMOST, _OUTERMOST = 60.0, 145.0
 _STOP_PX: Final = 8.0
-_SEEN_PX: Final = 3.0
-_ARROW_PX: Final = 9.0
 _ARC_STEP_DEG: Final = 4.0  # a chord leaves the largest circle by 0.1 px, less than a line is wide
-_MOST_ARC_STEPS: Final = 5_000
-"""A damaged record can have any rotation."""
 
 
 def polar(radius: float, azimuth_deg: float) -> Point:
@@ -58,61 +55,33 @@ def dial() -> str:
     return svg.drawing(SIZE, SIZE, "angle of the table, seen from above", parts)
 
 
-class PathStep(NamedTuple):
-    """A rotation of the camera around the object, positive to the left, and the number of the view at its end."""
+def polar_path(azimuths_deg: Mapping[int, float]) -> str:
+    """Draw the camera's positions, seen from above, and the rotations between them, each the short way.
 
-    number: int
-    rotation_deg: float
-
-
-def polar_path(start_deg: float, steps: Sequence[PathStep], *, named: Collection[int]) -> str:
-    """Draw the camera's positions, seen from above, and the rotations between them.
-
-    The path is a spiral: its radius grows with every view, so that it never covers itself. View k is at the sum of
-    ``start_deg``, the azimuth of the first one, and the first k of the measured rotations. The views ``named``, which
-    the report shows, have their number, the others a dot.
+    ``azimuths_deg`` are the azimuths of at least one view by the views' numbers, in the order of the search. The path
+    is a spiral: its radius grows with every view, so that it never covers itself.
     """
-    azimuth_deg = list(accumulate((step.rotation_deg for step in steps), initial=start_deg))
-    numbers = [1, *(step.number for step in steps)]
-    radius_step = min(30.0, (_OUTERMOST - _INNERMOST) / max(1, len(steps)))
-    first = (_INNERMOST + _OUTERMOST - radius_step * len(steps)) / 2
-    places = [(first + radius_step * k, azimuth) for k, azimuth in enumerate(azimuth_deg)]
+    rotations_deg = [wrap180(after - before) for before, after in pairwise(azimuths_deg.values())]
+    unwrapped_deg = list(accumulate(rotations_deg, initial=next(iter(azimuths_deg.values()))))
+    radius_step = min(30.0, (_OUTERMOST - _INNERMOST) / max(1, len(rotations_deg)))
+    first = (_INNERMOST + _OUTERMOST - radius_step * len(rotations_deg)) / 2
+    places = [(first + radius_step * k, azimuth_deg) for k, azimuth_deg in enumerate(unwrapped_deg)]
     parts = _rim()
-    for k, step in enumerate(steps):
-        arc = _arc(places[k], places[k + 1])
-        side = "left" if step.rotation_deg >= 0 else "right"
-        words = f"view {numbers[k]} to {step.number}: {side} {abs(step.rotation_deg):.1f}°"
-        parts.append(svg.path(arc, "step", svg.title(words)))
-        if step.number in named:
-            parts.append(_arrowhead(arc))
-    for number, place in zip(numbers, places, strict=True):
+    # The arcs lie below the views, whose discs cover their ends.
+    for rotation_deg, (start, end) in zip(rotations_deg, pairwise(places), strict=True):
+        side = "left" if rotation_deg >= 0 else "right"
+        parts.append(svg.path(_arc(start, end), "step", svg.title(f"{side} {abs(rotation_deg):.1f}°")))
+    for number, place in zip(azimuths_deg, places, strict=True):
         x, y = polar(*place)
         words = svg.title(f"view {number} at {azimuth_words(place[1])}°")
-        if number in named:
-            parts.append(svg.circle((x, y), _STOP_PX, "stop", words))
-            parts.append(svg.text(str(number), (x, y + 4), "stop-number"))
-        else:
-            parts.append(svg.circle((x, y), _SEEN_PX, "seen", words))
-    where = ", ".join(f"{azimuth_words(azimuth)}°" for azimuth in azimuth_deg)
-    label = f"Camera positions seen from above, in the order of the views: {where}"
-    return svg.drawing(SIZE, SIZE, label, parts)
+        parts.append(svg.circle((x, y), _STOP_PX, "stop", words))
+        parts.append(svg.text(str(number), (x, y + 4), "stop-number"))
+    where = ", ".join(f"{azimuth_words(azimuth_deg)}°" for azimuth_deg in unwrapped_deg)
+    return svg.drawing(SIZE, SIZE, f"Camera positions seen from above, in the order of the views: {where}", parts)
 
 
 def _arc(start: tuple[float, float], end: tuple[float, float]) -> list[Point]:
     """Return the points of the spiral between two (radius, azimuth), both included."""
     (r0, a0), (r1, a1) = start, end
-    steps = min(max(2, ceil(abs(a1 - a0) / _ARC_STEP_DEG)), _MOST_ARC_STEPS)
+    steps = max(2, ceil(abs(a1 - a0) / _ARC_STEP_DEG))
     return [polar(r0 + (r1 - r0) * i / steps, a0 + (a1 - a0) * i / steps) for i in range(steps + 1)]
-
-
-def _arrowhead(arc: Sequence[Point]) -> str:
-    """Return a triangle at the end of an arc that touches the disc of the view."""
-    x, y = arc[-1]
-    before = next((p for p in reversed(arc) if hypot(p[0] - x, p[1] - y) >= _STOP_PX + _ARROW_PX), arc[0])
-    heading = atan2(y - before[1], x - before[0])
-
-    def at(back: float, aside: float) -> Point:
-        return x - back * cos(heading) - aside * sin(heading), y - back * sin(heading) + aside * cos(heading)
-
-    tail = _STOP_PX + _ARROW_PX
-    return svg.path([at(_STOP_PX, 0), at(tail, _ARROW_PX / 2), at(tail, -_ARROW_PX / 2)], "arrow", close=True)

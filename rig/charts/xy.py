@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from math import ceil, floor, isfinite, log10
 from textwrap import wrap
-from typing import Final
+from typing import Final, NamedTuple
 
 from rig.charts import svg
 from rig.charts.svg import Point
@@ -55,8 +55,6 @@ class Axis:
 
     label: str
     """The quantity and its unit."""
-    log: bool = False
-    """Logarithmic scale."""
     falling: bool = False
     """Values grow downwards, as rows of an image do."""
     whole: bool = False
@@ -107,8 +105,9 @@ class Chart:
             height = unit_px * (y_range[1] - y_range[0])
             right = left + unit_px * (x_range[1] - x_range[0])
         bottom = top + height
-        x = _Scale(self.x, *x_range, left, right)
-        y = _Scale(self.y, *y_range, *((top, bottom) if self.y.falling else (bottom, top)))
+        x = _Scale(x_range[0], left, (right - left) / (x_range[1] - x_range[0]))
+        units_px = height / (y_range[1] - y_range[0])
+        y = _Scale(y_range[0], top, units_px) if self.y.falling else _Scale(y_range[0], bottom, -units_px)
 
         # From below to above: title and axes, then the curves; the key is outside the plot.
         parts = [svg.text(words, (0, 13 + _ROW_PX * row), "title", anchor="start") for row, words in enumerate(title)]
@@ -129,24 +128,19 @@ class Chart:
         return svg.drawing(width, end, self.label, parts, alone=alone)
 
 
-class _Scale:
-    def __init__(self, axis: Axis, low: float, high: float, low_px: float, high_px: float) -> None:
-        self._log, self._least, self._low_px = axis.log, low, low_px
-        self._low = log10(low) if axis.log else low
-        self._unit_px = (high_px - low_px) / ((log10(high) if axis.log else high) - self._low)
+class _Scale(NamedTuple):
+    low: float
+    low_px: float
+    unit_px: float
 
     def __call__(self, value: float) -> float:
-        shown = log10(max(value, self._least)) if self._log else value
-        return self._low_px + (shown - self._low) * self._unit_px
+        return self.low_px + (value - self.low) * self.unit_px
 
 
 def _range(axis: Axis, values: Sequence[float]) -> tuple[float, float]:
     """Return the ends of an axis: data, ticks and included values, with a margin beyond the data."""
-    shown = [value for value in (*values, *axis.span, *axis.ticks) if isfinite(value) and (value > 0 or not axis.log)]
+    shown = [value for value in (*values, *axis.span, *axis.ticks) if isfinite(value)]
     low, high = (min(shown), max(shown)) if shown else (0.0, 1.0)
-    if axis.log:
-        ratio = max(high / low, 2.0) ** _MARGIN
-        return low / ratio, high * ratio
     if high - low <= 1e-9 * max(abs(low), abs(high)):  # neighbouring numbers would be equal
         low, high = low - (abs(low) or 1.0) / 2, high + (abs(high) or 1.0) / 2
     margin = _MARGIN * (high - low)
@@ -157,13 +151,6 @@ def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
     """Return the values of an axis that have a number, and their words."""
     if axis.ticks:
         return list(zip(axis.ticks, axis.names or [number_words(tick, "g") for tick in axis.ticks], strict=True))
-    if axis.log:
-        decades = range(floor(log10(low)), ceil(log10(high)) + 1)
-        digits = (1, 2, 5) if len(decades) <= 3 else (1,)
-        all_ticks = (digit * 10.0**decade for decade in decades for digit in digits)
-        ticks = [(tick, f"{tick:.10g}") for tick in all_ticks if low <= tick <= high]
-        if len(ticks) > 1:  # a short axis takes those of a linear scale
-            return ticks
     least = (high - low) / _TICKS
     power = floor(log10(least))
     step, power = next(

@@ -1,6 +1,6 @@
 """Numbers, times and lists as people read them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from string import Formatter
 from typing import Any, Self
@@ -83,11 +83,6 @@ def joined(items: Sequence[str], conjunction: str = "and") -> str:
 def short(words: str, letters: int) -> str:
     """Return words cut to a number of letters, the last of them "…"."""
     return words if len(words) <= letters else f"{words[: letters - 1]}…"
-
-
-def listed(items: Iterable[str]) -> str:
-    """Return distinct items, in the order of their first appearance, separated by semicolons."""
-    return "; ".join(dict.fromkeys(items))
 
 
 def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:

@@ -14,12 +14,12 @@ from hbr.evaluation.changes import BENCH_CHANGE
 from hbr.evaluation.experiment import Experiment
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.trials import TRIALS
-from rig.charts.evaluation_figures import figures
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
+from rig.evaluation.figures import figures
 from rig.evaluation.tables import rows_of
 
 FOLDER: Final = Path("rig-eval")

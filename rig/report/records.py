@@ -1,34 +1,14 @@
-"""Records of enrollments and searches for a report, collected from the events of a running plan.
+"""The events of an enrollment or a search, as a report needs them, and the comparison of an answer with the truth."""
 
-A record has thumbnails instead of images, so that a long run needs little memory.
-"""
-
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import accumulate, pairwise
-from typing import Any, ClassVar, Final
+from typing import Final, TypeVar
 
 from hbr import Outcome
 from hbr.core.angles import wrap180
-from rig.charts.compass import PathStep
-from rig.events.events import (
-    Accepted,
-    Decided,
-    Enrolled,
-    Event,
-    FrameUsed,
-    Identified,
-    Moved,
-    Note,
-    Ranked,
-    Rejected,
-    SimilarObjects,
-    Started,
-    Verified,
-)
-from rig.report.pictures import Image, Region, thumbnail
-from rig.views.capture import ViewEvidence, rejection_text
+from rig.events.events import Accepted, Event, FrameUsed, Identified, Ranked, Rejected
+from rig.report.pictures import Region, thumbnail
 
 TILE: Final = (96, 96)
 """Width and height of a view on a contact sheet, pixels."""
@@ -39,83 +19,7 @@ FRAME: Final = (240, 240)
 VIEWS: Final = 12
 """Views of a search that a page shows. A search in motion takes sixty: too many to read one by one."""
 
-
-@dataclass(frozen=True, slots=True)
-class ReportView:
-    """An accepted view: thumbnail, evidence, the move before it, and the reasons for rejecting frames before it."""
-
-    index: int
-    azimuth_deg: float
-    picture_bgr: Image
-    evidence: ViewEvidence
-    move: Moved | None
-    rejected: tuple[str, ...]
-
-
-class _Record:
-    """The views of a plan, collected event by event.
-
-    ``region`` is the part of the images to show: x, y, width, height in pixels (`view.roi` of the configuration); None
-    shows all.
-    """
-
-    size: ClassVar[tuple[int, int]]
-    """Width and height of its pictures."""
-
-    def __init__(self, *, region: Region | None = None) -> None:
-        self.views: list[ReportView] = []
-        """The accepted views in the order of capture."""
-        self.conditions: Mapping[str, Any] = {}
-        self._region = region
-        self._move: Moved | None = None
-        self._rejected: list[str] = []
-
-    def add(self, event: Event) -> None:
-        """Add the next event of the plan."""
-        match event:
-            case Started():
-                self.conditions = event.conditions
-            case Moved():
-                self._move = event
-            case Rejected():
-                self._rejected.append(", ".join(rejection_text(reason, event.evidence) for reason in event.reasons))
-            case Accepted():
-                rejected, self._rejected = tuple(self._rejected), []
-                self.views.append(self._view(event, self._move, rejected))
-            case _:
-                pass
-
-    def _view(self, taken: Accepted, move: Moved | None, rejected: tuple[str, ...]) -> ReportView:
-        box = None if taken.segmentation is None else taken.segmentation.get("box_px")
-        picture = thumbnail(taken.image_bgr, self.size, self._region, box)
-        return ReportView(taken.index, taken.azimuth_deg, picture, taken.evidence, move, rejected)
-
-
-class EnrollmentRecord(_Record):
-    """One enrollment, collected event by event."""
-
-    size = TILE
-
-    def __init__(self, *, region: Region | None = None) -> None:
-        super().__init__(region=region)
-        self.name = ""
-        self.planned = 0
-        self.result: Enrolled | None = None
-        self.similar: SimilarObjects | None = None
-
-    @property
-    def retakes(self) -> int:
-        """Number of rejected frames, of all views."""
-        return sum(len(view.rejected) for view in self.views)
-
-    def add(self, event: Event) -> None:
-        super().add(event)
-        if isinstance(event, Started):
-            self.name, self.planned = event.name or "", event.views
-        elif isinstance(event, Enrolled):
-            self.result = event
-        elif isinstance(event, SimilarObjects):
-            self.similar = event
+Kind = TypeVar("Kind", bound=Event)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,38 +49,49 @@ class Correctness(StrEnum):
     WRONG = "wrong"
 
 
-class IdentificationRecord(_Record):
-    """One search, collected event by event; ``truth`` is the object on the table, None if it is not known."""
+@dataclass(eq=False)
+class Record:
+    """One enrollment or search, collected event by event, with thumbnails instead of images: a long run needs little.
 
-    size = FRAME
+    ``size`` is that of the thumbnails, ``region`` the part of the images to show: x, y, width, height in pixels
+    (`view.roi` of the configuration); None shows all. ``truth`` is the object on the table, None if it is not known.
+    """
 
-    def __init__(self, *, truth: Truth | None = None, region: Region | None = None) -> None:
-        super().__init__(region=region)
-        self.truth = truth
-        self.notes: tuple[Note, ...] = ()
-        self.ranked: list[Ranked] = []
-        self.used: list[FrameUsed] = []
-        self.decided: list[Decided] = []
-        self.verified: Verified | None = None
-        self.answer: Identified | None = None
+    size: tuple[int, int] = FRAME
+    region: Region | None = None
+    truth: Truth | None = None
+    events: list[Event] = field(default_factory=list, init=False)
 
     def add(self, event: Event) -> None:
-        super().add(event)
-        match event:
-            case Started():
-                self.notes = event.notes
-            case Ranked():
-                self.ranked.append(event)
-            case FrameUsed():
-                self.used.append(event)
-            case Verified():
-                self.verified = event
-            case Decided():
-                self.decided.append(event)
-            case Identified():
-                self.answer = event
-            case _:
-                pass
+        """Add the next event of the plan."""
+        if isinstance(event, Accepted):
+            box = None if event.segmentation is None else event.segmentation.get("box_px")
+            event = replace(event, image_bgr=thumbnail(event.image_bgr, self.size, self.region, box))
+        self.events.append(event)
+
+    def all(self, kind: type[Kind]) -> list[Kind]:
+        """Return the events of a kind, in their order."""
+        return [event for event in self.events if isinstance(event, kind)]
+
+    def last(self, kind: type[Kind], index: int | None = None) -> Kind | None:
+        """Return the last event of a kind, or the last one about the view of that index; None if there is none."""
+        found = [event for event in self.all(kind) if index is None or getattr(event, "index", None) == index]
+        return found[-1] if found else None
+
+    @property
+    def views(self) -> list[Accepted]:
+        """The accepted views in the order of capture."""
+        return self.all(Accepted)
+
+    @property
+    def retakes(self) -> int:
+        """Number of rejected frames, of all views."""
+        return len(self.all(Rejected))
+
+    @property
+    def answer(self) -> Identified | None:
+        """The answer of a search."""
+        return self.last(Identified)
 
     @property
     def correctness(self) -> Correctness | None:
@@ -211,9 +126,9 @@ class IdentificationRecord(_Record):
         return answer.yaw_set_deg[0] if answer is not None and answer.name is not None and answer.yaw_set_deg else None
 
     @property
-    def shown(self) -> list[ReportView]:
+    def shown(self) -> list[Accepted]:
         """The views of a page: those after which the search decided, at most `VIEWS`, evenly chosen."""
-        decided = {event.index for event in self.ranked}
+        decided = {event.index for event in self.all(Ranked)}
         views = [view for view in self.views if view.index in decided] or self.views
         if len(views) <= VIEWS:
             return views
@@ -228,32 +143,12 @@ class IdentificationRecord(_Record):
     def enough(self) -> FrameUsed | None:
         """The frame in motion after which the evidence was enough for an answer; None if there is none."""
         taken = self.rotated_deg
-        return next((one for one in self.used if one.outcome is not Outcome.CONTINUE and one.index in taken), None)
+        frames = self.all(FrameUsed)
+        return next((one for one in frames if one.outcome is not Outcome.CONTINUE and one.index in taken), None)
 
     @property
     def rotated_deg(self) -> dict[int, float]:
         """The rotation of the camera since the first view, by the index of each view; always the short way."""
-        ways = (abs(wrap180(b.azimuth_deg - a.azimuth_deg)) for a, b in pairwise(self.views))
-        return dict(zip((view.index for view in self.views), accumulate(ways, initial=0.0), strict=False))
-
-    @property
-    def steps(self) -> list[PathStep]:
-        """The camera's rotations between the views, as the table made them; in motion, those between decisions.
-
-        The cable's limits may make the table rotate the long way: the azimuths show the end of a rotation, and the
-        encoder its number of revolutions.
-        """
-        steps: list[PathStep] = []
-        last: Decided | None = None
-        for before, after in pairwise(self.views):
-            rotation_deg = wrap180(after.azimuth_deg - before.azimuth_deg)
-            if after.move is not None:
-                rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
-            decided = next((d for d in reversed(self.decided) if d.index <= before.index), None)
-            if decided is None:  # a damaged run
-                continue
-            if decided is last and after.evidence.motion is not None:
-                rotation_deg += steps.pop().rotation_deg
-            steps.append(PathStep(after.index + 1, rotation_deg))
-            last = decided
-        return steps
+        views = self.views
+        ways = (abs(wrap180(b.azimuth_deg - a.azimuth_deg)) for a, b in pairwise(views))
+        return dict(zip((view.index for view in views), accumulate(ways, initial=0.0), strict=False))

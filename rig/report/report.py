@@ -18,9 +18,20 @@ from rig.charts.compass import polar_path
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
-from rig.core.phrases import azimuth_words, counted, listed, percent_words, sentence, signed
+from rig.core.phrases import azimuth_words, counted, percent_words, sentence, signed
 from rig.core.templates import environment
-from rig.events.events import Identified
+from rig.events.events import (
+    Accepted,
+    Decided,
+    Enrolled,
+    FrameUsed,
+    Identified,
+    Moved,
+    Ranked,
+    Rejected,
+    Started,
+    Verified,
+)
 from rig.events.wording import (
     NOT_ENROLLED,
     answer_words,
@@ -31,12 +42,12 @@ from rig.events.wording import (
     outcome_words,
     ranking_words,
     share_words,
-    similar_objects_words,
     verification_words,
 )
 from rig.report.pictures import contact_sheet, data_uri, thumbnail
-from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord, ReportView
+from rig.report.records import Correctness, Record
 from rig.search.saved_run import SavedRun
+from rig.views.capture import rejection_text
 
 _STAMP: Final = (56, 56)  # px: it only helps to recognise the object; every picture makes the file of the report larger
 _LEADING: Final = 3
@@ -78,8 +89,8 @@ class Meta:
 def render_report(
     title: str,
     summary: str,
-    enrollments: Sequence[EnrollmentRecord],
-    identifications: Sequence[IdentificationRecord],
+    enrollments: Sequence[Record],
+    identifications: Sequence[Record],
     *,
     meta: Meta,
 ) -> str:
@@ -111,7 +122,7 @@ def run_report(saved: SavedRun) -> str:
 
     Raises `UsageError`: the run is damaged.
     """
-    record = IdentificationRecord(region=saved.config.view.roi)
+    record = Record(region=saved.config.view.roi)
     about = saved.about
     with saved.damage():
         for event in saved.events():
@@ -119,7 +130,7 @@ def run_report(saved: SavedRun) -> str:
         answer = record.answer
         found = "no answer" if answer is None else outcome_words(answer)
         meta = Meta(
-            conditions={"bench": about.bench, **record.conditions, "devices": about.devices},
+            conditions={"bench": about.bench, **saved.started.conditions, "devices": about.devices},
             wall_clock={"software": about.software},
             date=about.started_utc,
         )
@@ -146,17 +157,16 @@ Shown = dict[str, Any]
 """The values of a part of the page, by their names in the template."""
 
 
-def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unfold: bool) -> Shown:
+def _retrieval(number: int, record: Record, styles: Styles, *, unfold: bool) -> Shown:
     answer, views = record.answer, record.views
     error_deg = record.pose_error_deg
     shown = record.shown
     path = candidates = Markup()
     if len(views) > 1:
-        start_deg = _report_azimuth_deg(record, views[0].azimuth_deg)
-        path = Markup(polar_path(start_deg, record.steps, named={view.index + 1 for view in shown}))
+        path = Markup(polar_path({view.index + 1: _report_azimuth_deg(record, view.azimuth_deg) for view in shown}))
     # The chart of the candidates; the path above needs two views.
     rotated_deg, enough = record.rotated_deg, record.enough
-    known = [event for event in record.ranked if event.index in rotated_deg]  # all, except in a damaged run
+    known = [event for event in record.all(Ranked) if event.index in rotated_deg]  # all, except in a damaged run
     if known:
         chart = candidates_chart(
             known,
@@ -169,7 +179,7 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
         candidates = Markup(chart.svg())
     return Shown(
         number=number,
-        stamp=data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
+        stamp=data_uri(thumbnail(views[0].image_bgr, _STAMP)) if views else "",
         truth=_truth(record),
         answer=outcome_words(answer) if answer else "no answer",
         correctness=record.correctness,
@@ -183,18 +193,22 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
         path_words="on the table" if record.yaw_deg is None else "as enrolled",
         candidates=candidates,
         motion=_motion_words(record),
-        notes=[f"{sentence(note_words(note))} {in_words(note_steps(note))}" for note in record.notes],
+        notes=[
+            f"{sentence(note_words(note))} {in_words(note_steps(note))}"
+            for started in record.all(Started)
+            for note in started.notes
+        ],
         frames=[_frame(record, view, styles) for view in shown],
         hidden=len(views) - len(shown),
         unfold=unfold or record.correctness is Correctness.WRONG,
     )
 
 
-def _answer(record: IdentificationRecord) -> str:
+def _answer(record: Record) -> str:
     return answer_words(record.answer) if record.answer else "The search ended without an answer."
 
 
-def _truth(record: IdentificationRecord) -> str:
+def _truth(record: Record) -> str:
     if record.truth is None:
         return ""
     if record.truth.name is not None:
@@ -202,14 +216,14 @@ def _truth(record: IdentificationRecord) -> str:
     return f"{record.truth.description} (never enrolled)" if record.truth.description else "never enrolled"
 
 
-def _report_azimuth_deg(record: IdentificationRecord, azimuth_deg: float) -> float:
+def _report_azimuth_deg(record: Record, azimuth_deg: float) -> float:
     """Convert to the azimuth scale of the report: that of the enrollment if the object was found, else the table's."""
     return wrap360(azimuth_deg - (record.yaw_deg or 0.0))
 
 
-def _motion_words(record: IdentificationRecord) -> str:
+def _motion_words(record: Record) -> str:
     """Return which frames of a search in motion were used; empty for runs that do not contain this."""
-    frames, enough = record.used, record.enough
+    frames, enough = record.all(FrameUsed), record.enough
     if not frames:
         return ""
     last = frames[-1]
@@ -225,9 +239,9 @@ def _motion_words(record: IdentificationRecord) -> str:
     )
 
 
-def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> Shown:
-    thought = next((event for event in record.ranked if event.index == view.index), None)
-    decided = next((event for event in record.decided if event.index == view.index), None)
+def _frame(record: Record, view: Accepted, styles: Styles) -> Shown:
+    thought, decided = record.last(Ranked, view.index), record.last(Decided, view.index)
+    moved, verified = record.last(Moved, view.index), record.last(Verified)
     leading = []
     if thought:
         leading = [
@@ -237,39 +251,39 @@ def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> Sh
             leading.append((NOT_ENROLLED, styles[NOT_ENROLLED], "", percent_words(thought.decision.not_enrolled)))
     # What a search decides at its end follows from all of these, so the last card says all of them.
     words = [ranking_words(thought)]
-    if view is record.views[-1]:
-        words += [verification_words(record.verified)] if record.verified else []
+    if view is record.views[-1] and verified is not None:
+        words.append(verification_words(verified))
     return Shown(
         number=view.index + 1,
-        picture=data_uri(view.picture_bgr),
+        picture=data_uri(view.image_bgr),
         where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
-        rejected=_rejections(view),
+        rejected=_rejections(record, view),
         leading=leading,
         margin=signed(thought.margin, 3) if thought else "",
         decided=" ".join(sentence(one) for one in words if one),
-        moved=sentence(move_words(view.move)) if view.move and view.index else "",
+        moved=sentence(move_words(moved)) if moved and view.index else "",
         decision=decision_words(decided) if decided else "",
     )
 
 
-def _rejections(view: ReportView) -> str:
-    """Return why frames were rejected before a view. A search in motion may reject dozens."""
-    reasons = dict.fromkeys(view.rejected)
-    more = len(reasons) - _REASONS
-    return "; ".join(list(reasons)[:_REASONS]) + (f"; and {more} more" if more > 0 else "")
+def _rejections(record: Record, view: Accepted | None = None) -> str:
+    """Return why frames were rejected, all or those before a view. A search in motion may reject dozens."""
+    rejected = [one for one in record.all(Rejected) if view is None or one.index == view.index]
+    texts = dict.fromkeys(", ".join(rejection_text(reason, one.evidence) for reason in one.reasons) for one in rejected)
+    more = len(texts) - _REASONS
+    return "; ".join(list(texts)[:_REASONS]) + (f"; and {more} more" if more > 0 else "")
 
 
-def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> Shown:
-    views, retakes = record.views, record.retakes
+def _object(number: int, record: Record, *, unfold: bool) -> Shown:
+    views, retakes, started = record.views, record.retakes, record.last(Started)
+    name = started.name if started and started.name else ""
     line = counted(len(views), "view")
-    if record.result is None:
-        line += f" of {record.planned}: not finished"
     if retakes:
         line += f", {counted(retakes, 'retake')}"
-    shown = Shown(number=number, name=record.name, line=line, unfold=unfold, items=enrollment_items(record), sheet="")
+    shown = Shown(number=number, name=name, line=line, unfold=unfold, items=enrollment_items(record), sheet="")
     if views:
-        pictures, azimuth_deg = [view.picture_bgr for view in views], [view.azimuth_deg for view in views]
-        label = f"Contact sheet of {record.name}: {line}, each with its azimuth in degrees"
+        pictures, azimuth_deg = [view.image_bgr for view in views], [view.azimuth_deg for view in views]
+        label = f"Contact sheet of {name}: {line}, each with its azimuth in degrees"
         shown["sheet"] = Markup(contact_sheet(pictures, azimuth_deg, label))
         shown["stamp"] = data_uri(thumbnail(pictures[0], _STAMP))
     return shown
@@ -308,20 +322,17 @@ class SummaryItem(NamedTuple):
     note: str = ""
 
 
-def count_of(correctness: Correctness, records: Sequence[IdentificationRecord]) -> int:
+def count_of(correctness: Correctness, records: Sequence[Record]) -> int:
     """Return the number of searches with this correctness."""
     return sum(record.correctness is correctness for record in records)
 
 
-def totals(
-    enrollments: Sequence[EnrollmentRecord], identifications: Sequence[IdentificationRecord]
-) -> Iterator[SummaryItem]:
+def totals(enrollments: Sequence[Record], identifications: Sequence[Record]) -> Iterator[SummaryItem]:
     """Yield the headline numbers of a run; the numbers of a single enrollment are beside its views instead."""
     if len(enrollments) + len(identifications) > 1 and enrollments:
         views = counted(sum(len(record.views) for record in enrollments), "view")
         retakes = counted(sum(record.retakes for record in enrollments), "retake")
-        finished = sum(record.result is not None for record in enrollments)
-        yield SummaryItem("objects enrolled", f"{finished}", f"{views}, {retakes}")
+        yield SummaryItem("objects enrolled", f"{len(enrollments)}", f"{views}, {retakes}")
     answers = [record.answer for record in identifications if record.answer is not None]
     if len(identifications) == 1 and not identifications[0].truth:
         for answer in answers:
@@ -351,15 +362,12 @@ def totals(
         )
 
 
-def enrollment_items(record: EnrollmentRecord) -> Iterator[SummaryItem]:
+def enrollment_items(record: Record) -> Iterator[SummaryItem]:
     """Yield the numbers of one enrollment."""
-    views = record.views
-    yield SummaryItem("views", f"{len(views)}", f"of {record.planned} planned")
-    yield SummaryItem("retakes", f"{record.retakes}", listed(reason for view in views for reason in view.rejected))
-    if record.similar:
-        yield SummaryItem("compared with the catalog", "; ".join(similar_objects_words(record.similar)))
-    if record.result:
-        yield SummaryItem("bench time", f"{record.result.seconds:.0f} s")
+    yield SummaryItem("views", f"{len(record.views)}")
+    yield SummaryItem("retakes", f"{record.retakes}", _rejections(record))
+    if (done := record.last(Enrolled)) is not None:
+        yield SummaryItem("bench time", f"{done.seconds:.0f} s")
 
 
 def _answer_items(answer: Identified) -> Iterator[SummaryItem]:

@@ -30,16 +30,7 @@ from rig.events.wording import line
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
-from rig.report import (
-    Correctness,
-    EnrollmentRecord,
-    IdentificationRecord,
-    Meta,
-    Truth,
-    count_of,
-    render_report,
-    write_report,
-)
+from rig.report import TILE, Correctness, Meta, Record, Truth, count_of, render_report, write_report
 from rig.search.model import Model, load_model
 from rig.search.session import AnyStrategy
 from rig.search.strategies import descriptor_for, strategy_for
@@ -91,8 +82,8 @@ SimObject = Solid | PhotographsOnTable
 class DemoResult:
     """The result of a demo; everything but ``wall_s`` is determined by the seed."""
 
-    enrollments: tuple[EnrollmentRecord, ...]
-    trials: tuple[IdentificationRecord, ...]
+    enrollments: tuple[Record, ...]
+    trials: tuple[Record, ...]
     seed: int
     strategy: str
     change: Change | None
@@ -282,21 +273,19 @@ def _photograph(bench: Bench, operator: ShelfOperator, views: int, *, marked: bo
             pass
 
 
-def _enroll_all(
-    bench: Bench, catalog: Catalog, names: Sequence[str], views: int, *, say: bool
-) -> list[EnrollmentRecord]:
+def _enroll_all(bench: Bench, catalog: Catalog, names: Sequence[str], views: int, *, say: bool) -> list[Record]:
     records, done = [], 0
     with ProgressBar("enrolling") as progress:
         for name in names:
-            record = EnrollmentRecord(region=bench.config.view.roi)
+            record = Record(TILE, bench.config.view.roi)
             for event in enroll(bench, catalog, name, views=views):
                 record.add(event)
                 if isinstance(event, Accepted):
                     done += 1
                     progress(JobProgress(done, len(names) * views))
             records.append(record)
-            if say and record.result:
-                progress.note(line(record.result))
+            if say:
+                progress.note(line(event))
     return records
 
 
@@ -309,10 +298,10 @@ def _identify(
     *,
     enrolled: bool,
     say: bool,
-) -> IdentificationRecord:
+) -> Record:
     """Put an object on the table in a random orientation and identify it."""
     operator.next_object = thing.name
-    record = IdentificationRecord(region=bench.config.view.roi)
+    record = Record(region=bench.config.view.roi)
     if say:
         print(f"\nIdentifying the object on the table. It is {thing.name}, but the program does not know that.")
     for event in identify(bench, model, strategy=strategy):
@@ -329,7 +318,7 @@ def _identify(
     return record
 
 
-def _trial(trial: IdentificationRecord) -> dict[str, Any]:
+def _trial(trial: Record) -> dict[str, Any]:
     assert trial.truth is not None
     assert trial.answer is not None
     return {

@@ -54,18 +54,6 @@ def test_square_chart_has_equal_units(y: list[float]) -> None:
     assert (right[0] - origin[0]) / 300 == pytest.approx((origin[1] - up[1]) / y[2], rel=0.01)
 
 
-def test_logarithmic_axis_spaces_decades_evenly_and_has_their_numbers() -> None:
-    chart = Chart("decades", Axis("x", log=True), Axis("y"), (Series("", [0.01, 0.1, 1.0, 10.0], [1, 2, 3, 4]),))
-    x = [at[0] for at in markers(chart)]
-    assert [b - a for a, b in pairwise(x)] == pytest.approx([x[1] - x[0]] * 3, abs=0.05)
-    assert {"0.01", "0.1", "1", "10"} <= set(words(having(chart.svg(), "axis")))
-
-
-def test_short_logarithmic_axis_has_numbers() -> None:
-    chart = Chart("t", Axis("x", log=True), Axis("y", log=True), (Series("", [2.1, 4.9], [2.1, 2.1]),))
-    assert {"2.5", "3.0", "4.5"} <= set(words(having(chart.svg(), "axis")))
-
-
 def test_numbers_are_round_and_have_the_decimals_of_their_step() -> None:
     chart = Chart("t", Axis("view", whole=True), Axis("score"), [Series("σ = 0.125", (1, 2, 3), (0.981, 0.99, 0.9874))])
     numbers = words(having(chart.svg(), "axis"))

@@ -1,6 +1,7 @@
 """Event streams as the plans yield them, for the tests of the reports."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from rig.events.events import (
     Started,
     Weighed,
 )
-from rig.report import EnrollmentRecord, IdentificationRecord, Truth
+from rig.report import TILE, Record, Truth
 from rig.safety.gyro_rotation import Stillness
 from rig.views.capture import ViewEvidence
 from rig.views.description import BENCH_DESCRIPTOR
@@ -162,15 +163,23 @@ def searching_densely(
     )
 
 
-def enrolled(*args: object, **kwargs: object) -> EnrollmentRecord:
-    record = EnrollmentRecord()
-    for event in enrolling(*args, **kwargs):  # type: ignore[arg-type]
+def recorded(record: Record, events: Iterable[Event]) -> Record:
+    for event in events:
         record.add(event)
     return record
 
 
-def identified(*args: object, truth: Truth | None = None, **kwargs: object) -> IdentificationRecord:
-    record = IdentificationRecord(truth=truth)
-    for event in identifying(*args, **kwargs):  # type: ignore[arg-type]
-        record.add(event)
+def enrolled(*args: object, **kwargs: object) -> Record:
+    return recorded(Record(TILE), enrolling(*args, **kwargs))  # type: ignore[arg-type]
+
+
+def identified(*args: object, truth: Truth | None = None, **kwargs: object) -> Record:
+    return recorded(Record(truth=truth), identifying(*args, **kwargs))  # type: ignore[arg-type]
+
+
+def ambiguous(truth: Truth) -> Record:
+    """Return a search for one of two objects; as always, the answer's name is that of the leading candidate."""
+    record = identified("mug-white", (90.0,), truth=truth)
+    assert record.answer is not None
+    record.add(replace(record.answer, outcome=Outcome.AMBIGUOUS, possible=("mug-white", "mug-star")))
     return record

@@ -111,6 +111,7 @@ def _rates(
 
 
 def _title(results: dict[str, Any]) -> str:
+    """Return the data set and its noise; results.json, beside the figures, has all settings."""
     settings = results["settings"]
     dataset, condition, protocol = settings["dataset"], settings["condition"], settings["protocol"]
     size = condition["size_px"] or max(dataset["width_px"], dataset["height_px"])
@@ -120,17 +121,4 @@ def _title(results: dict[str, Any]) -> str:
     ]
     if results["reported"]:
         words.append("objects {} to {}".format(*results["reported"]))
-    if condition["background"] != "same":
-        words.append(f"{condition['background']} background")
-    if condition["rotation_deg"]:
-        words.append(f"rotated by up to {condition['rotation_deg']:g}°")
-    if condition["perturbations"] != "none":
-        kinds = condition["perturbations"].split("+")
-        words.append("+".join(kinds) if len(kinds) <= 2 else f"{len(kinds)} perturbations")
-    if protocol["enrolled"]:
-        words.append(f"{protocol['enrolled']} views enrolled")
-    if condition["descriptor"] != "cedd":
-        words.append(condition["descriptor"])
-    if condition["prefilter_px"]:
-        words.append(f"prefilter {condition['prefilter_px']:g} px")
     return "; ".join(words)
