@@ -1,22 +1,22 @@
-"""The command line program `rig`: all commands, grouped as in its help."""
+"""The command line program `rig`: its commands, grouped as in its help. Each is imported when it is called."""
 
-import inspect
+import ast
 import re
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
-from importlib.metadata import entry_points, version
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points, version
+from importlib.util import find_spec
 from io import TextIOWrapper
-from typing import Annotated, Any, Final, Unpack
+from pkgutil import resolve_name
+from typing import Annotated, Any, Final, Unpack, cast
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
-from rig.cli.bench import config, doctor, head, serve, servo, snapshot, table
-from rig.cli.catalog import catalog, exchange, results
-from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.cli.ui.options import CommonOptions, show_parameters, spread
@@ -26,48 +26,50 @@ from rig.core.control_characters import neutral
 from rig.core.errors import OutputFailed, RigError, UsageError
 from rig.core.signals import EXIT_BY_SIGNAL, handle_signals
 
+SECTIONS: Final[dict[str, dict[str, str | None]]] = {
+    "Start here": {
+        "doctor": "bench.doctor:doctor",
+        "empty-table": "bench.table:empty_table",
+        "enroll": "objects.enroll:enroll",
+        "identify": "objects.identify:identify",
+        "results": "catalog.results:app",
+        "catalog": "catalog.catalog:app",
+        "status": "bench.status:status",
+        "stop": "bench.stop:stop",
+        "acknowledge": "bench.table:acknowledge",
+        "serve": "bench.serve:serve",
+    },
+    "Saved searches and experiments": {
+        "replay": "objects.runs:replay",
+        "report": "objects.runs:report",
+        "eval": "objects.evaluate:evaluate",
+    },
+    "Exchange and log": {
+        "import": "catalog.exchange:import_",
+        "export": "catalog.exchange:export",
+        "log": "catalog.results:log",
+    },
+    "Table": {"home": "bench.table:home", "goto": "bench.table:goto", "jog": "bench.table:jog"},
+    "Devices and settings": {
+        "setup": "bench.doctor:setup",
+        "find": "bench.doctor:find",
+        "config": "bench.config:app",
+        "calibrate": None,
+        "snapshot": "bench.snapshot:snapshot",
+        "servo": "bench.servo:app",
+        "head": "bench.head:app",
+    },
+    "Simulated bench": {"demo": None, "faults": None, "sim-bench": None},
+}
+"""The places of the commands in `rig.cli`, by the sections and in the order of the help; None is a plug-in.
+
+The first section is for each day.
+"""
+PLACES: Final = {name: place for places in SECTIONS.values() for name, place in places.items()}
 GROUP = "rig.commands"
 _WANTS_JSON = "rig.wants_json"
 _TYPER_USAGE_ERROR: Any = typer.BadParameter.__base__
 """Typer exports no name for it, and the module of the class depends on Typer's version."""
-
-
-class _Commands(TyperGroup):
-    """All commands. With ``--json`` an error in the arguments is also printed as JSON, as other errors are."""
-
-    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        wants_json = "--json" in args
-        with _usage_error(json=wants_json):
-            context = super().make_context(info_name, args, parent, **extra)
-        context.meta[_WANTS_JSON] = wants_json
-        return context
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands in their sections, and then the options; the help of Typer begins with the options."""
-        texts: dict[str, str] = {str(one.name): inspect.getdoc(one.callback) or "" for one in app.registered_commands}
-        for group in app.registered_groups:
-            texts[str(group.name)] = str(group.typer_instance.info.help) if group.typer_instance else ""
-        texts = {name: neutral(re.split(r"\.\s", text)[0].removesuffix(".")) + "." for name, text in texts.items()}
-        named = {name for names in SECTIONS.values() for name in names}
-        sections = {
-            title: [(name, texts[name]) for name in names if name in texts] for title, names in SECTIONS.items()
-        }
-        sections["Plug-ins"] = [(neutral(name), text) for name, text in texts.items() if name not in named]
-        options: Any = self.get_params(ctx)
-        sections["Options"] = [
-            (f"{', '.join(sorted(one.opts))} {one.metavar or ''}".rstrip(), one.help) for one in options
-        ]
-        formatter.write(f"{self.get_usage(ctx)}\n\n{self.help}\n")
-        for title, rows in sections.items():
-            if rows:
-                with formatter.section(title):
-                    formatter.write_dl(rows)
-        formatter.write(f"\n{self.epilog}\n")
-
-    def invoke(self, ctx: Any) -> Any:
-        handle_signals()  # from here on, a signal unwinds the stack; until here the program was at its start
-        with _usage_error(json=ctx.meta[_WANTS_JSON]):
-            return super().invoke(ctx)
 
 
 class _Subcommands(TyperGroup):
@@ -78,6 +80,120 @@ class _Subcommands(TyperGroup):
             formatter.write_dl(
                 [(name, self.commands[name].get_short_help_str(limit=200)) for name in self.list_commands(ctx)]
             )
+
+
+class _Table(Mapping[str, Any]):
+    """The commands by name. To import all of them takes a second, so each is imported and built when it is asked for.
+
+    ``registered`` are commands that Typer has built.
+    """
+
+    def __init__(self, registered: Mapping[str, Any]) -> None:
+        self._registered = registered
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**PLACES, **_plugins(), **self._registered})
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self._registered:
+            return self._registered[name]
+        place = PLACES.get(name)
+        found = _plugin(name) if place is None else resolve_name(f"{__package__}.{place}")
+        if found is None:
+            raise KeyError(name)
+        return _built(name, found)
+
+
+@cache
+def _plugins() -> dict[str, EntryPoint]:
+    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+@cache
+def _plugin(name: str) -> Any:
+    """Return the function or the group of a plug-in; None if there is none, or it cannot be loaded."""
+    point = _plugins().get(name)
+    try:
+        return None if point is None else point.load()
+    except Exception as broken:  # the other commands work without this plug-in
+        notice = f"The plug-in {point.value if point else ''} cannot be loaded, so there is no command {name}: {broken}"
+        print(neutral(notice), file=sys.stderr)
+        return None
+
+
+@cache
+def _built(name: str, one: Any) -> Any:
+    """Return a function or a group as a command of Typer, with its options."""
+    frame = typer.Typer(rich_markup_mode=None)
+    if isinstance(one, typer.Typer):
+        frame.add_typer(one, name=name, cls=_Subcommands)
+    else:  # the angle of goto can be negative
+        frame.command(name, context_settings={"ignore_unknown_options": True} if name == "goto" else None)(one)
+    return typer.main.get_group(frame).commands[name]
+
+
+def _sentence(name: str) -> str:
+    """Return the first sentence about a command, "" if it cannot be loaded; our own are read without an import."""
+    place = PLACES.get(name)
+    if place is None:
+        found = _plugin(name)
+        text = _built(name, found).help if found else ""
+    else:
+        module, _, function = place.partition(":")
+        tree = ast.parse(find_spec(f"{__package__}.{module}").loader.get_source(f"{__package__}.{module}"))  # type: ignore
+        text = ast.get_docstring(next((one for one in tree.body if getattr(one, "name", "") == function), tree))
+    return neutral(re.split(r"\.\s", text)[0].removesuffix(".")) + "." if text else ""
+
+
+class _Commands(TyperGroup):
+    """All commands. With ``--json`` an error in the arguments is also printed as JSON, as other errors are."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = cast(Any, _Table(self.commands))
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        wants_json = "--json" in args
+        with _usage_error(json=wants_json):
+            context = super().make_context(info_name, args, parent, **extra)
+        context.meta[_WANTS_JSON] = wants_json
+        return context
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        found = super().resolve_command(ctx, args)
+        handle_signals()  # until here only modules were imported, and Ctrl+C ended the program at once
+        return found
+
+    def invoke(self, ctx: Any) -> Any:
+        with _usage_error(json=ctx.meta[_WANTS_JSON]):
+            return super().invoke(ctx)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete the names from their texts alone."""
+        ctx.command = named = copy(self)
+        named.commands = {name: TyperCommand(name, help=_sentence(name)) for name in self.commands}
+        return super(_Commands, named).shell_complete(ctx, incomplete)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands in their sections, and then the options; the help of Typer begins with the options."""
+        others = {"Plug-ins": [name for name in self.commands if name not in PLACES]}
+        sections = {
+            title: [(neutral(name), text) for name in names if (text := _sentence(name))]
+            for title, names in ({title: list(places) for title, places in SECTIONS.items()} | others).items()
+        }
+        options: Any = self.get_params(ctx)
+        sections["Options"] = [
+            (f"{', '.join(sorted(one.opts))} {one.metavar or ''}".rstrip(), one.help) for one in options
+        ]
+        formatter.write(f"{self.get_usage(ctx)}\n\n{self.help}\n")
+        for title, rows in sections.items():
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+        formatter.write(f"\n{self.epilog}\n")
 
 
 @contextmanager
@@ -129,69 +245,6 @@ common.__doc__ = None  # or it would replace the help of the app
 show_parameters(common, spread(common))
 app.callback()(common)
 
-SECTIONS: Final[dict[str, dict[str, Any]]] = {
-    "Start here": {
-        "doctor": doctor.doctor,
-        "empty-table": snapshot.empty_table,
-        "enroll": enroll.enroll,
-        "identify": identify.identify,
-        "results": results.app,
-        "catalog": catalog.app,
-        "status": table.status,
-        "stop": table.stop,
-        "acknowledge": table.acknowledge,
-        "serve": serve.serve,
-    },
-    "Saved searches and experiments": {"replay": runs.replay, "report": runs.report, "eval": evaluate.evaluate},
-    "Exchange and log": {"import": exchange.import_, "export": exchange.export, "log": results.log},
-    "Table": {"home": table.home, "goto": table.goto, "jog": table.jog},
-    "Devices and settings": {
-        "setup": doctor.setup,
-        "find": doctor.find,
-        "config": config.app,
-        "calibrate": None,
-        "snapshot": snapshot.snapshot,
-        "servo": servo.app,
-        "head": head.app,
-    },
-    "Simulated bench": {"demo": None, "faults": None, "sim-bench": None},
-}
-"""The commands in the sections and in the order of the help; None is a plug-in. The first section is for each day."""
-
-
-def _add(name: str, one: Any) -> None:
-    if isinstance(one, typer.Typer):
-        app.add_typer(one, name=name, cls=_Subcommands)
-    else:  # the angle of goto can be negative
-        app.command(name, context_settings={"ignore_unknown_options": True} if name == "goto" else None)(one)
-
-
-for _names in SECTIONS.values():
-    for _name, _one in _names.items():
-        if _one is not None:
-            _add(_name, _one)
-for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
-    try:
-        _plugin = _point.load()
-    except Exception as _broken:  # the other commands work without this plug-in
-        _notice = f"The plug-in {_point.value} cannot be loaded, so there is no command {_point.name}: {_broken}"
-        print(neutral(_notice), file=sys.stderr)
-        continue
-    _add(_point.name, _plugin)
-
-
-def _with_commands_for(arguments: list[str]) -> typer.Typer:
-    """Return the app with the commands that a start with these arguments needs; with all if that is not clear.
-
-    Typer builds every command that an app has, with its options, at each start: half the computing of a short command
-    such as status. The help of `rig` reads only their texts.
-    """
-    only = copy(app)
-    only.registered_commands = [one for one in app.registered_commands if one.name in arguments[:1]]
-    only.registered_groups = [one for one in app.registered_groups if one.name in arguments[:1]]
-    is_help = arguments in ([], ["--help"], ["-h"])
-    return only if is_help or only.registered_commands or only.registered_groups else app
-
 
 def main() -> None:
     """Run the command line."""
@@ -203,7 +256,7 @@ def main() -> None:
     with checked_output():
         try:
             try:
-                _with_commands_for(sys.argv[1:])()
+                app()
             finally:
                 sys.stdout.flush()
         except OutputFailed as error:

@@ -1,40 +1,36 @@
-"""`rig config ...`."""
+"""Show, check and change the configuration."""
 
+from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from pydantic import BaseModel
 
-from rig.cli.ui.command import command
+from rig.bench import check_config
+from rig.bench.changes import set_key
+from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore, apparatus, apply_results
+from rig.cli.ui.command import Group
 from rig.cli.ui.settings import Settings
+from rig.config import RigConfig
+from rig.config.values import FILE_NAME, Values, default_path, read_values, search_paths
+from rig.config.wording import KeyInfo, key_info, setting_line
 from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError, UsageError
 from rig.core.masking import masked
 from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from pydantic import BaseModel
-
-    from rig.calibrations import CalibrationResult
-    from rig.config import RigConfig
-    from rig.config.values import Values
-    from rig.config.wording import KeyInfo
-
-app = typer.Typer(help="Show, check and change the configuration.", no_args_is_help=True)
+app = Group(__doc__)
 
 
 @app.command("check")
-@command
 def check(settings: Settings) -> None:
     """Check the whole configuration and list all mistakes. Exit code 3 if there is one.
 
     Example: rig config check --config rig.toml
     """
-    from rig.config.wording import key_info
-
     values, config, _ = _checked(settings)
     given = sum(values.origin(info.key) != "default" for info in key_info(type(config)))
     where = str(values.path) if values.path else "No file: every key has its default"
@@ -43,7 +39,6 @@ def check(settings: Settings) -> None:
 
 
 @app.command("show")
-@command
 def show(
     settings: Settings,
     wanted: Annotated[
@@ -59,15 +54,11 @@ def show(
 
     Example: rig config show servo table.limits_deg
     """
-    from rig.calibrations import apply_results
-    from rig.config.values import search_paths
-    from rig.config.wording import setting_line
-
     values, config, options = _checked(settings)
     in_force = _calibrations_in_force(settings, config)
     applied, _ = apply_results(config, in_force)
 
-    def origin(info: "KeyInfo") -> str:
+    def origin(info: KeyInfo) -> str:
         calibrated = [one.id for one in in_force if info.name in one.settings]
         return values.origin(info.key) if not calibrated or values.origin(info.key) != "default" else calibrated[-1]
 
@@ -107,7 +98,6 @@ def show(
 
 
 @app.command("set", context_settings={"ignore_unknown_options": True})
-@command
 def set_(
     settings: Settings,
     key: Annotated[
@@ -123,11 +113,6 @@ def set_(
 
     Example: rig config set servo.port /dev/ttyUSB1
     """
-    from rig.bench.changes import set_key
-    from rig.config import RigConfig
-    from rig.config.values import FILE_NAME, default_path
-    from rig.config.wording import key_info
-
     target = settings.config or default_path() or Path(FILE_NAME)
     if "." not in key and key not in {info.name for info in key_info(RigConfig)} - {"bench"}:
         raise UsageError(
@@ -139,28 +124,22 @@ def set_(
     settings.say(text, {"path": target, "key": key, "changed": changed})
 
 
-def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseModel]]":
-    from rig.bench import check_config
-    from rig.config.values import read_values
+def _checked(settings: Settings) -> tuple[Values, RigConfig, dict[str, BaseModel]]:
 
     values = read_values(settings.config, settings.overrides)
     return values, *check_config(values)
 
 
-def _calibrations_in_force(settings: Settings, config: "RigConfig") -> "list[CalibrationResult]":
+def _calibrations_in_force(settings: Settings, config: RigConfig) -> list[CalibrationResult]:
     """Return the bench's calibrations in force, as far as it is known without opening the bench."""
-    from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus
-
     name = settings.bench or config.default_bench
     mounted = apparatus(name, {part: {} for part in ("servo", "imu", "camera")}, config, {})
     found = CalibrationStore(config.calibration_path(name)).on_bench(mounted, SystemClock().utc())
     return [one.result for one in found if one.status is CalibrationStatus.IN_FORCE]
 
 
-def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyInfo, Any]]":
+def _keys(config: RigConfig, options: Mapping[str, BaseModel]) -> Iterator[tuple[KeyInfo, Any]]:
     """Yield description and value of every key; the options of benches come last."""
-    from rig.config.wording import key_info
-
     for info in key_info(type(config)):
         if info.key != ("bench",):
             yield info, info.value(config)
@@ -170,7 +149,6 @@ def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[
 
 
 def _unknown(wanted: str, names: list[str]) -> ConfigError:
-    from difflib import get_close_matches
 
     names += sorted({name.rpartition(".")[0] for name in names} - {""})
     near = get_close_matches(wanted, names, n=1)

@@ -1,19 +1,19 @@
-"""`rig head`: the rig head's identity and serial number."""
+"""Show the rig head, or store its serial number."""
 
 from contextlib import closing
 from typing import Annotated
 
 import typer
 
-from rig.cli.bench.doctor import doctor_context
-from rig.cli.ui.command import command
+from rig.cli.ui.command import Group
 from rig.cli.ui.settings import Settings
+from rig.devices.head.link import HeadLink, version
+from rig.devices.head.protocol import BAUD, SERIAL_UNSET, Board
 
-app = typer.Typer(help="Show the rig head, or store its serial number.", no_args_is_help=True)
+app = Group(__doc__)
 
 
 @app.command("info")
-@command
 def info(settings: Settings) -> None:
     """Show board, firmware and serial number of the rig head. Switches nothing.
 
@@ -23,7 +23,6 @@ def info(settings: Settings) -> None:
 
 
 @app.command("set-serial")
-@command
 def set_serial(
     settings: Settings,
     serial: Annotated[int, typer.Argument(metavar="N", min=0, max=2**32 - 2, help="Serial number of this head.")],
@@ -37,10 +36,7 @@ def set_serial(
 
 def _show(settings: Settings, serial: int | None) -> None:
     """Store the serial number unless it is None, and print the head's identity."""
-    from rig.devices.head.link import HeadLink, version
-    from rig.devices.head.protocol import BAUD, SERIAL_UNSET, Board
-
-    with doctor_context(settings) as context:
+    with settings.open_parts() as context:
         context.require_free()
         port, clock = context.config.head.port, context.computer.clock
         with closing(context.computer.open_serial(port, BAUD, "head")) as connection:

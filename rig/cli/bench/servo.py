@@ -1,33 +1,36 @@
-"""`rig servo ...`."""
+"""Change the settings, the id and the baud rate of the servo, and record a trace."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 
-from rig.cli.bench.doctor import doctor_context, show_progress
-from rig.cli.ui.command import command
+from rig.cli.ui.command import Group
+from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption
+from rig.cli.ui.present import show_progress
 from rig.cli.ui.prompts import ask_yes_no, confirm
 from rig.cli.ui.settings import Settings
+from rig.config.toml_file import read_text, save, with_values
+from rig.config.values import default_path
 from rig.core.errors import ReplayMismatch
 from rig.core.next_steps import Do
 from rig.core.phrases import counted
+from rig.devices.dynamixel import settings as servo_settings
+from rig.devices.trace import read_trace
+from rig.doctor.context import DoctorContext, open_context
+from rig.doctor.replay import replay_devices, replay_drivers
+from rig.doctor.single_servo import SingleServo, single_servo
+from rig.jobs.trace import REACH_DEG
+from rig.jobs.trace import record as record_job
 
-if TYPE_CHECKING:
-    from rig.doctor.context import DoctorContext
-    from rig.doctor.single_servo import SingleServo
-
-app = typer.Typer(
-    help="Change the settings, the id and the baud rate of the servo, and record a trace.", no_args_is_help=True
-)
+app = Group(__doc__)
 SHOWN: Final = 8
 """Differences that an error lists without --json."""
 
 
 @app.command("settings")
-@command
 def settings_(
     settings: Settings,
     write: Annotated[
@@ -39,19 +42,15 @@ def settings_(
 
     Example: rig servo settings --write --bench sim
     """
-    from rig.devices.dynamixel.settings import compare
-    from rig.devices.dynamixel.settings import write as write_settings
-    from rig.doctor.single_servo import single_servo
-
-    with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
+    with settings.open_parts() as context, single_servo(context, show_progress) as servo:
         show_progress("")
-        differences = compare(servo.bus, servo.found.bus_id, servo.table, context.config.table.mode)
+        differences = servo_settings.compare(servo.bus, servo.found.bus_id, servo.table, context.config.table.mode)
         if not settings.json:
             print(servo.found)
             print("\n".join(f"  {difference}" for difference in differences) or "  all as required")
         written = bool(differences) and write and (yes or settings.json or ask_yes_no("Write these settings?"))
         if written:
-            write_settings(servo.bus, servo.found.bus_id, servo.table, differences)
+            servo_settings.write(servo.bus, servo.found.bus_id, servo.table, differences)
     if settings.json:
         rows = [{"register": d.register, "found": d.found, "wanted": d.wanted, "reason": d.reason} for d in differences]
         settings.print_json({**_identity(servo), "differences": rows, "written": written})
@@ -64,7 +63,6 @@ def settings_(
 
 
 @app.command("set-id")
-@command
 def set_id(
     settings: Settings,
     new: Annotated[int, typer.Argument(metavar="ID", min=0, max=252, help="New id.")],
@@ -78,7 +76,6 @@ def set_id(
 
 
 @app.command("set-baud")
-@command
 def set_baud(
     settings: Settings,
     rate: Annotated[int, typer.Argument(metavar="RATE", min=1, help="New baud rate, for example 1000000.")],
@@ -92,7 +89,6 @@ def set_baud(
 
 
 @app.command("record")
-@command
 def record(
     settings: Settings,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="New file for the trace.")],
@@ -105,13 +101,9 @@ def record(
 
     Example: rig servo record servo.jsonl --bench sim --yes
     """
-    from rig.cli.ui.desk import CommandDesk
-    from rig.jobs.trace import REACH_DEG
-    from rig.jobs.trace import record as record_job
-
     if not still:
         confirm(f"The table rotates by up to {REACH_DEG:.0f}° and back.", yes=yes, settings=settings)
-    with doctor_context(settings) as context:
+    with settings.open_parts() as context:
         port = context.computer.serial_port(context.config.servo.port)
     adapter = {key: port.usb.get(key) for key in ("idVendor", "idProduct")} if port else {}
     desk = CommandDesk(settings.tracing(file))
@@ -121,7 +113,6 @@ def record(
 
 
 @app.command("replay")
-@command
 def replay_(
     settings: Settings,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Trace from rig servo record.")],
@@ -130,10 +121,6 @@ def replay_(
 
     Example: rig servo replay servo.jsonl
     """
-    from rig.devices.trace import read_trace
-    from rig.doctor.context import open_context
-    from rig.doctor.replay import replay_devices, replay_drivers
-
     trace = read_trace(file)
     # The sensor of a rig head is not compared, and the head would switch the servo's supply.
     sensor = trace.config.imu.model_copy(update={"connection": "i2c"})
@@ -159,9 +146,8 @@ def replay_(
 
 
 def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
-    from rig.doctor.single_servo import single_servo
 
-    with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
+    with settings.open_parts() as context, single_servo(context, show_progress) as servo:
         show_progress("")
         old = servo.found.bus_id if what == "id" else servo.found.baud
         if not settings.json:
@@ -185,11 +171,8 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
         print(f"To use it: {context.step(Do.SET_KEY(key=f'servo.{what}', value=new)).command}")
 
 
-def _follow(settings: Settings, context: "DoctorContext", what: str, old: int, new: int) -> str:
+def _follow(settings: Settings, context: DoctorContext, what: str, old: int, new: int) -> str:
     """Update the configuration file if it had the old value, and return its path; empty if it was not changed."""
-    from rig.config.toml_file import read_text, save, with_values
-    from rig.config.values import default_path
-
     path = settings.config or default_path()
     configured = getattr(context.config.servo, what)
     if path is None or not path.exists() or configured != old or configured == new:
@@ -198,7 +181,7 @@ def _follow(settings: Settings, context: "DoctorContext", what: str, old: int, n
     return str(path)
 
 
-def _identity(servo: "SingleServo") -> dict[str, Any]:
+def _identity(servo: SingleServo) -> dict[str, Any]:
     found = servo.found
     return {
         "model": found.model,

@@ -1,4 +1,4 @@
-"""`rig snapshot` and `rig empty-table`."""
+"""`rig snapshot`."""
 
 import sys
 from contextlib import closing
@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.bench.doctor import check_new, doctor_context, write_new
 from rig.cli.ui.command import command
+from rig.cli.ui.options import check_new, write_new
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
+from rig.doctor.camera import open_camera
+from rig.views.image_files import encode
 
 
 @command
@@ -30,15 +32,12 @@ def snapshot(
 
     Example: rig snapshot table.png --bench sim
     """
-    from rig.doctor.camera import open_camera
-    from rig.views.image_files import encode
-
     check_new(file, ".png")
     if refocus and settings.load().camera.focus is not None:
         raise UsageError(
             "camera.focus is a number.", next_step=("Release it first.", Do.SET_KEY(key="camera.focus", value="none"))
         )
-    with doctor_context(settings) as context:
+    with settings.open_parts() as context:
         context.require_free()
         with closing(open_camera(context, refocus=refocus)) as camera:
             frame = camera.capture(context.computer.clock.now_ns())
@@ -50,26 +49,3 @@ def snapshot(
     if refocus:
         focus = "The camera reports no focus" if locks.focus is None else f"The focus is {locks.focus:g} now"
         print(f"{focus}.", file=sys.stderr)
-
-
-@command
-def empty_table(
-    settings: Settings,
-    anyway: Annotated[
-        bool,
-        typer.Option("--anyway", help="Store the image although something on the table rotates: a pattern or a screw."),
-    ] = False,
-) -> None:
-    """Take an image of the empty table. Do this once a day, and when the light has changed.
-
-    Objects are found by comparing views with this image. First take everything off the table. The table rotates a
-    little to check that it is empty. If the check fails, the previous image stays in use. A camera that moves around
-    the object takes an image at each azimuth of enroll.views; no check then finds a forgotten object.
-
-    Example: rig empty-table --bench sim
-    """
-    from rig.cli.ui.desk import CommandDesk
-    from rig.jobs.table_image import take_table_image
-
-    desk = CommandDesk(settings)
-    desk.run("empty-table", take_table_image(desk, anyway=anyway))

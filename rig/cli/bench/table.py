@@ -1,4 +1,4 @@
-"""`rig goto`, `rig home`, `rig jog`, `rig status`, `rig stop` and `rig acknowledge`."""
+"""`rig goto`, `rig home`, `rig jog`, `rig acknowledge` and `rig empty-table`."""
 
 import os
 import select
@@ -7,28 +7,21 @@ import termios
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
-from rig.cli.bench.doctor import doctor_context
 from rig.cli.ui.command import command
+from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.settings import Settings
-from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from rig.events.events import Event
-    from rig.jobs.table import JogKey
-
-
-_UNSHOWN: Final = ("_ns", "_number", "who_am_i", "_rthz", "trajectory_deg", "trajectory_dps")
-"""Ends of the keys that `rig status` prints with --json only."""
+from rig.events.events import Event, event_dict
+from rig.events.wording import line
+from rig.jobs import table
+from rig.jobs.table import JogKey
+from rig.jobs.table_image import take_table_image
 
 
 @command
@@ -40,11 +33,8 @@ def goto(
 
     Example: rig goto -90 --bench sim
     """
-    from rig.cli.ui.desk import CommandDesk
-    from rig.jobs.table import goto as goto_job
-
     desk = CommandDesk(settings)
-    desk.run("goto", goto_job(desk, angle_deg))
+    desk.run("goto", table.goto(desk, angle_deg))
 
 
 @command
@@ -53,10 +43,7 @@ def home(
     revolutions: Annotated[
         int | None,
         typer.Option(
-            metavar="N",
-            min=-250,
-            max=250,
-            help="Revolutions by which the cable is wound up; 0 if it hangs free.",
+            metavar="N", min=-250, max=250, help="Revolutions that the cable is wound up; 0 if it hangs free."
         ),
     ] = None,
     here: Annotated[bool, typer.Option("--here", help="Make the present angle home. Moves nothing.")] = False,
@@ -70,121 +57,12 @@ def home(
 
     Example: rig home --revolutions 0 --bench sim
     """
-    from rig.cli.ui.desk import CommandDesk
-    from rig.jobs.table import home as home_job
-    from rig.jobs.table import refer
-
     if here and revolutions is not None:
         raise UsageError("--here and --revolutions cannot be combined.", next_step="Give one of them.")
     desk = CommandDesk(settings, yes=yes)
-    job = refer(desk, here=True) if here else home_job(desk, revolutions=revolutions)
+    job = table.refer(desk, here=True) if here else table.home(desk, revolutions=revolutions)
     if not desk.run("reference" if here else "home", job) and not here:
         raise typer.Exit(EXIT_DECLINED)
-
-
-@command
-def status(settings: Settings) -> None:
-    """Show the state of the bench and its devices, even if some of them are missing. Moves nothing.
-
-    Example: rig status --bench sim --json
-    """
-    from rig.jobs.status import bench_report
-
-    report = bench_report(
-        settings.load().state_path(settings.bench_name),
-        partial(settings.open_bench, tell=False, devices=()),
-        partial(doctor_context, settings),
-    )
-    settings.say("\n".join(_report_lines(report)), report)
-    for device in ("servo", "imu", "camera"):  # the exit code is that of the first device that does not work
-        if error := report.get(device, {}).get("error"):
-            raise typer.Exit(error["code"] // 100)
-
-
-def _report_lines(report: "Mapping[str, Any]") -> Iterator[str]:
-    """Yield a report in lines; of a bench that a server uses, without its devices."""
-    from rig.core.next_steps import in_words, steps_from_json
-    from rig.core.phrases import angle_words, budget_words
-
-    page, is_open = report.get("page"), "state" in report
-    yield f"bench    {report['bench']}{f', served at {page}' if page else '' if is_open else ': not open'}"
-    if is_open or page:
-        yield f"state    {_state_words(report)}"
-    if problem := report.get("error"):
-        yield f"error    {problem['code']}: {problem['detail']}"
-        yield f"         Next step: {problem['next_step']}"
-    if limits_deg := report.get("limits_deg"):
-        angle_deg = report.get("table_deg")
-        angle = "angle in doubt" if angle_deg is None else angle_words(angle_deg, 2)
-        yield f"table    {angle}; cable budget {budget_words(tuple(limits_deg))}"
-    if page:
-        yield f"job      {report.get('job') or 'none'}"
-        return
-    for device in ("servo", "imu", "head", "camera"):
-        if values := report.get(device):
-            error = values.get("error")
-            failed = error and [f"error {error['code']}: {error['detail']}", f"Next step: {error['next_step']}"]
-            yield from (f"{'' if n else device:8s} {line}" for n, line in enumerate(failed or _device_lines(values)))
-    yield from (f"note     {finding}" for finding in report.get("findings", ()))
-    if not report.get("fault") and not report.get("doubt") and (steps := report.get("steps")):
-        yield f"         {in_words(steps_from_json(steps))}"
-
-
-def _state_words(report: "Mapping[str, Any]") -> str:
-    state, fault, doubt = report.get("state", "not open"), report.get("fault"), report.get("doubt")
-    if fault is not None:
-        return f"{state} {fault['code']} since {fault['utc']}: {fault['detail']} {fault['next_step']}"
-    return f"{state}: {doubt} (`rig home --help`)" if doubt else str(state)
-
-
-def _device_lines(values: "Mapping[str, Any]") -> Iterator[str]:
-    """Yield the values of a device, and in further lines those of its parts: "load 3 %, voltage 12 V"."""
-    from rig.config.wording import unit
-    from rig.core.phrases import in_unit, number
-
-    parts = {name: part for name, part in values.items() if isinstance(part, dict)}
-    for name, part in ({"": {key: value for key, value in values.items() if key not in parts}} | parts).items():
-        shown = []
-        for key, value in part.items():
-            if (
-                key.endswith(_UNSHOWN)
-                or value is None
-                or value is False
-                or (value == 0 and name in ("bus", "connection"))
-            ):
-                continue
-            of, suffix = unit(key), f"_{key.rpartition('_')[2]}"
-            words = key.removesuffix(suffix if of else "").replace("_", " ")
-            if isinstance(value, list):
-                words += f" {', '.join(map(str, value)) or 'none'}"
-            elif isinstance(value, float):
-                words += f" {in_unit(number(value, '.5g'), of)}"
-            elif key.endswith("address"):
-                words += f" {value:#04x}"
-            elif value is not True:
-                words += f" {in_unit(str(value), of)}"
-            shown.append(words)
-        yield f"{name}: {', '.join(shown) or 'none yet'}" if name else ", ".join(shown)
-
-
-@command
-def stop(settings: Settings) -> None:
-    """Stop the table and switch its torque off, even if another program moves it. Its plan ends and can be resumed.
-
-    Example: rig stop --bench sim
-    """
-    from rig.jobs.stop import stop as stop_bench
-
-    done = stop_bench(settings.bench_name, settings.load(), SystemClock(), seed=settings.seed)
-    who = done.holder
-    if who is None:
-        text = f"No program held the bench; the torque was {'on, and is off now' if done.torque_was_on else 'off'}."
-    elif done.ended:
-        text = f"Process {who.pid} (`{who.command}`) has ended: the table is stopped, its torque off."
-    else:
-        text = f"Process {who.pid} (`{who.command}`) has stopped the table and its torque; it still holds the bench."
-    report = {"bench": settings.bench_name, "pid": who.pid if who else None, "ended": done.ended}
-    settings.say(text, {**report, "torque_was_on": done.torque_was_on})
 
 
 @command
@@ -200,22 +78,39 @@ def acknowledge(
 
     Example: rig acknowledge --reboot --bench sim
     """
-    from rig.cli.ui.desk import CommandDesk
-    from rig.jobs.table import acknowledge as acknowledge_job
-
     desk = CommandDesk(settings)
-    desk.run("acknowledge", acknowledge_job(desk, reboot=reboot))
+    desk.run("acknowledge", table.acknowledge(desk, reboot=reboot))
+
+
+@command
+def empty_table(
+    settings: Settings,
+    anyway: Annotated[
+        bool,
+        typer.Option("--anyway", help="Store the image although something on the table rotates: a pattern or a screw."),
+    ] = False,
+) -> None:
+    """Take an image of the empty table. Do this once a day, and when the light has changed.
+
+    Objects are found by comparing views with this image. First take everything off the table. The table rotates a
+    little to check that it is empty. If the check fails, the previous image stays in use. A camera that moves around
+    the object takes an image at each azimuth of enroll.views; no check then finds a forgotten object.
+
+    Example: rig empty-table --bench sim
+    """
+    desk = CommandDesk(settings)
+    desk.run("empty-table", take_table_image(desk, anyway=anyway))
 
 
 # longer: the shown angle is behind the table; shorter: the servo is asked more often than the eye needs
 _WAIT_S: Final = 0.2
 _KEYS: Final = {
-    b"\x1b[C": "forward",
-    b"\x1b[D": "back",
-    b"\x1b[A": "larger-step",
-    b"\x1b[B": "smaller-step",
-    b"h": "home",
-    b"q": "end",
+    b"\x1b[C": JogKey.FORWARD,
+    b"\x1b[D": JogKey.BACK,
+    b"\x1b[A": JogKey.LARGER_STEP,
+    b"\x1b[B": JogKey.SMALLER_STEP,
+    b"h": JogKey.HOME,
+    b"q": JogKey.END,
 }
 """The bytes that a terminal sends for each key."""
 
@@ -232,21 +127,16 @@ def jog(
 
     Example: rig jog --step 1 --bench sim
     """
-    from rig.cli.ui.desk import CommandDesk
-    from rig.events.events import event_dict
-    from rig.events.wording import line
-    from rig.jobs.table import jog as jog_job
-
     if not sys.stdin.isatty():
         raise UsageError("rig jog needs a terminal.", next_step=("In scripts,", Do.GOTO()))
 
-    def show(event: "Event") -> None:
+    def show(event: Event) -> None:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)  # a key held down must not rotate the table after its end
         settings.say(line(event), event_dict(event))
 
     desk = CommandDesk(settings)
     with _keys_at_once():
-        desk.run("jog", jog_job(desk, _pressed(step), step_deg=step), show)
+        desk.run("jog", table.jog(desk, _pressed(step), step_deg=step), show)
     print("The torque is off. To make this angle home: rig home --here", file=sys.stderr)
 
 
@@ -262,10 +152,8 @@ def _keys_at_once() -> Iterator[None]:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
-def _pressed(step: float) -> "Iterator[JogKey | None]":
+def _pressed(step: float) -> Iterator[JogKey | None]:
     """Show the keys, and yield those that are pressed, or None while there is none; end with the terminal."""
-    from rig.jobs.table import JogKey
-
     print(f"→ +{step:g}°   ← −{step:g}°   ↑ ↓ step   h home   q end   Ctrl+C stop", file=sys.stderr)
     while True:
         keys = b""
@@ -278,4 +166,4 @@ def _pressed(step: float) -> "Iterator[JogKey | None]":
                 return
         # in the other mode of the cursor keys, O replaces the bracket
         keys = keys.replace(b"\x1bO", b"\x1b[")
-        yield next((JogKey(name) for code, name in _KEYS.items() if keys.startswith(code)), None)
+        yield next((key for code, key in _KEYS.items() if keys.startswith(code)), None)

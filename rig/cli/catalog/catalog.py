@@ -1,33 +1,36 @@
-"""`rig catalog ...`: the objects of a catalog one by one, and the catalog as a whole.
-
-Decision: docs/decisions/0010.
-"""
+"""Manage the enrolled objects."""
 
 import sys
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from rig.cli.ui.command import command
+from rig.catalog import ObjectDetails
+from rig.catalog.describing import Described, described
+from rig.catalog.images import path_of
+from rig.catalog.journal import Journal, deliver_journal, delivery_words
+from rig.catalog.journal import discard as discard_object
+from rig.catalog.upkeep import collect_garbage
+from rig.catalog.verify import verify as verify_job
+from rig.cli.ui.command import Group
 from rig.cli.ui.exit_codes import EXIT_CATALOG
 from rig.cli.ui.options import YesOption
+from rig.cli.ui.present import print_table, run_job, size_words
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
-from rig.core.errors import UsageError
+from rig.core.errors import CatalogError, UsageError
+from rig.core.json_form import plain
 from rig.core.phrases import angle_words, counted
+from rig.views.description import SegmentationSummary
 
-if TYPE_CHECKING:
-    from rig.catalog import ObjectDetails
-    from rig.catalog.describing import Described
-
-app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
+# Decision: docs/decisions/0010.
+app = Group(__doc__)
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the object.")]
 
 
 @app.command("list")
-@command
 def list_(
     settings: Settings,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
@@ -40,8 +43,6 @@ def list_(
 
     Example: rig catalog list --label kitchen --bench sim
     """
-    from rig.cli.ui.present import print_table
-
     with settings.open_catalog(read_only=True) as catalog:
         objects = [one for one in catalog.objects(deleted=deleted) if label in (None, one.label)]
         if settings.json:
@@ -66,7 +67,6 @@ def list_(
 
 
 @app.command("show")
-@command
 def show(settings: Settings, name: NameArgument) -> None:
     """Show an object: its enrollments with their sessions, and the angles of its views. Exit code 7 if it is damaged.
 
@@ -75,9 +75,6 @@ def show(settings: Settings, name: NameArgument) -> None:
 
     Example: rig catalog show mug-white --bench sim
     """
-    from rig.catalog.describing import Described, described
-    from rig.core.errors import CatalogError
-
     found, problem = Described({}, ()), None
     with settings.open_catalog(read_only=True) as catalog:
         details = catalog.object(name)
@@ -94,11 +91,8 @@ def show(settings: Settings, name: NameArgument) -> None:
         raise problem
 
 
-def _as_json(details: "ObjectDetails", described: "Described") -> dict[str, Any]:
+def _as_json(details: ObjectDetails, described: Described) -> dict[str, Any]:
     """Return an object with its views and their descriptions as JSON values: every column by its name."""
-    from rig.catalog.images import path_of
-    from rig.core.json_form import plain
-    from rig.views.description import SegmentationSummary
 
     def columns(row: Any) -> dict[str, Any]:
         names = [column.key for column in type(row).__mapper__.column_attrs]
@@ -128,9 +122,7 @@ def _as_json(details: "ObjectDetails", described: "Described") -> dict[str, Any]
     return dict(plain(shown))
 
 
-def _print_object(details: "ObjectDetails", described: "Described") -> None:
-    from rig.cli.ui.present import print_table
-    from rig.views.description import SegmentationSummary
+def _print_object(details: ObjectDetails, described: Described) -> None:
 
     summary = details.summary
     print("  ".join(filter(None, (summary.name, summary.label))))
@@ -162,7 +154,6 @@ def _print_object(details: "ObjectDetails", described: "Described") -> None:
 
 
 @app.command("rename")
-@command
 def rename_(
     settings: Settings,
     name: NameArgument,
@@ -178,7 +169,6 @@ def rename_(
 
 
 @app.command("label")
-@command
 def label_(
     settings: Settings,
     name: NameArgument,
@@ -201,7 +191,6 @@ def label_(
 
 
 @app.command("delete")
-@command
 def delete_(
     settings: Settings,
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of the objects.")],
@@ -221,7 +210,6 @@ def delete_(
 
 
 @app.command("undelete")
-@command
 def undelete_(
     settings: Settings, name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the deleted object.")]
 ) -> None:
@@ -239,17 +227,13 @@ def undelete_(
 
 
 @app.command("verify")
-@command
 def verify(settings: Settings) -> None:
     """Check whether everything is as it was stored. The exit code is 7 if it is not. Nothing is changed.
 
     Example: rig catalog verify --bench sim
     """
-    from rig.catalog.verify import verify as job
-    from rig.cli.ui.present import run_job, size_words
-
     with settings.open_catalog(read_only=True) as catalog:
-        found = run_job("verifying", job(catalog), interrupted="Interrupted; nothing was changed.")
+        found = run_job("verifying", verify_job(catalog), interrupted="Interrupted; nothing was changed.")
     checked = ", ".join(
         counted(number, noun)
         for number, noun in ((found.objects, "object"), (found.views, "view"), (found.results, "result"))
@@ -263,7 +247,6 @@ def verify(settings: Settings) -> None:
 
 
 @app.command("gc")
-@command
 def gc(
     settings: Settings,
     old: Annotated[bool, typer.Option("--old", help="Also remove replaced and abandoned enrollments.")] = False,
@@ -274,10 +257,6 @@ def gc(
 
     Example: rig catalog gc --dry-run --bench sim
     """
-    from rig.catalog.upkeep import collect_garbage
-    from rig.cli.ui.present import size_words
-    from rig.core.json_form import plain
-
     with settings.open_catalog() as catalog:
         found = collect_garbage(catalog, old=old, dry_run=True)
         names = ", ".join(found.objects[:10]) + (" and others" if len(found.objects) > 10 else "")
@@ -295,7 +274,6 @@ def gc(
 
 
 @app.command("deliver")
-@command
 def deliver(
     settings: Settings,
     rename: Annotated[
@@ -316,9 +294,6 @@ def deliver(
 
     Example: rig catalog deliver --rename mug-white mug-white-2
     """
-    from rig.catalog.journal import Journal, deliver_journal, delivery_words
-    from rig.catalog.journal import discard as remove
-
     place = settings.place
     if place.url is None:
         raise UsageError(
@@ -332,7 +307,7 @@ def deliver(
             if rename is not None:
                 journal.rename(*rename)
             if discard is not None:
-                remove(journal, discard)
+                discard_object(journal, discard)
     done = deliver_journal(place, SystemClock(), replacing=replace or ())
     for one in done:
         print(f"{'' if one.conflict is None else 'Note: '}{delivery_words(one, place)}", file=sys.stderr)

@@ -1,26 +1,33 @@
 """`rig import` and `rig export`."""
 
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import Annotated, Final, Literal
 
 import typer
 
+from rig.calibrations import CalibrationStore
+from rig.catalog import Catalog
+from rig.catalog.exchange.bundle import read_bundle, write_bundle
+from rig.catalog.exchange.photographs import Photographs, read_photographs
+from rig.catalog.exchange.scan import ScanFormat, write_scan
+from rig.catalog.exchange.tables import TableFormat, write_folder, write_views
+from rig.catalog.exchange.training import Annotations, write_training
+from rig.catalog.transfer import CatalogSource, Conflict, TransferSource, transfer
 from rig.cli.ui.command import command
 from rig.cli.ui.options import JobsOption
+from rig.cli.ui.present import run_job, size_words
 from rig.cli.ui.settings import Settings
+from rig.config.catalog_place import DATABASE_NAME
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
+from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import counted
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rig.catalog import Catalog
-    from rig.catalog.transfer import TransferSource
+from rig.views.description import DESCRIPTORS
 
 SHOWN: Final = 20
 """Number of rejected files and of objects that are listed. With --json all of them are."""
@@ -78,12 +85,6 @@ def import_(
 
     Example: rig import /media/stick/catalog --on-conflict skip --bench sim
     """
-    from rig.catalog.exchange.photographs import Photographs
-    from rig.catalog.transfer import Conflict, transfer
-    from rig.cli.ui.present import run_job, size_words
-    from rig.core.json_form import plain
-    from rig.views.description import DESCRIPTORS
-
     clock = SystemClock()
     begin_ns = clock.now_ns()
     with _source(source, pattern, table_angles, empty_table) as objects, _target(settings, dry_run) as catalog:
@@ -115,10 +116,8 @@ def import_(
 
 
 @contextmanager
-def _target(settings: Settings, dry_run: bool) -> "Iterator[Catalog]":
+def _target(settings: Settings, dry_run: bool) -> Iterator[Catalog]:
     """Yield the catalog; an empty one in its place for a ``dry_run`` before there is one."""
-    from rig.catalog import Catalog
-
     if not dry_run or settings.place.may_exist():
         with settings.open_catalog(read_only=dry_run, create=not dry_run) as catalog:
             yield catalog
@@ -130,14 +129,8 @@ def _target(settings: Settings, dry_run: bool) -> "Iterator[Catalog]":
 @contextmanager
 def _source(
     source: Path, pattern: str | None, table_angles: bool, empty_table: Path | None
-) -> "Iterator[TransferSource]":
+) -> Iterator[TransferSource]:
     """Yield what is imported: a bundle, a catalog such as a training set, or photographs."""
-    from rig.catalog import Catalog
-    from rig.catalog.exchange.bundle import read_bundle
-    from rig.catalog.exchange.photographs import read_photographs
-    from rig.catalog.transfer import CatalogSource
-    from rig.config.catalog_place import DATABASE_NAME
-
     clock = SystemClock()
     is_named = pattern is not None or table_angles
     is_folder = source.is_dir() and not (source / DATABASE_NAME).exists()
@@ -196,15 +189,6 @@ def export(
 
     Example: rig export scan mug-white --format colmap --bench sim
     """
-    from rig.calibrations import CalibrationStore
-    from rig.catalog.exchange.bundle import write_bundle
-    from rig.catalog.exchange.scan import ScanFormat, write_scan
-    from rig.catalog.exchange.tables import TableFormat, write_folder, write_views
-    from rig.catalog.exchange.training import Annotations, write_training
-    from rig.catalog.transfer import CatalogSource
-    from rig.cli.ui.present import run_job
-    from rig.core.json_form import plain
-
     form = format_ or _FORMAT_OF.get(target.suffix.lower())
     if form is None:
         suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in _FORMAT_OF.items())

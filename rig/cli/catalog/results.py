@@ -1,21 +1,25 @@
-"""`rig results ...` and `rig log`: the recorded answers of identifications, and who did what."""
+"""Show, export and correct the recorded answers of identifications."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypedDict, Unpack
+from typing import Annotated, Any, Final, Literal, TypedDict, Unpack
 
 import typer
 
-from rig.cli.ui.command import command
+from rig.catalog.exchange.tables import RESULTS, TableFormat, plain_row, write_rows
+from rig.catalog.log import shown
+from rig.catalog.records import RecordedOutcome
+from rig.catalog.results import Answer, Result, ResultFilter, find_result, find_results
+from rig.catalog.results import correct as correct_result
+from rig.cli.ui.command import Group, command
+from rig.cli.ui.present import print_table
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
+from rig.core.json_form import plain
 from rig.core.phrases import angle_words, counted, short
 
-if TYPE_CHECKING:
-    from rig.catalog.results import Answer, Result
-
-app = typer.Typer(help="Show, export and correct the recorded answers of identifications.", no_args_is_help=True)
+app = Group(__doc__)
 
 _LONGEST_DETAIL: Final = 60
 """Letters of a detail of the log in a table; --json has all."""
@@ -36,7 +40,6 @@ class Filters(TypedDict):
 
 
 @app.command("list")
-@command
 def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
     """List results, oldest first. Filters use the corrected values.
 
@@ -44,9 +47,6 @@ def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
 
     Example: rig results list --sample S-0042 --since 7d --bench sim
     """
-    from rig.catalog.exchange.tables import plain_row
-    from rig.cli.ui.present import print_table
-
     found = _find(settings, filters)
     if settings.json:
         for result in found:
@@ -71,16 +71,11 @@ def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
 
 
 @app.command("show")
-@command
 def show(settings: Settings, result: ResultArgument) -> None:
     """Show a result: the answer, what it is based on, and its corrections.
 
     Example: rig results show 12 --bench sim
     """
-    from rig.catalog.exchange.tables import plain_row
-    from rig.catalog.results import find_result
-    from rig.core.json_form import plain
-
     with settings.open_catalog(read_only=True) as catalog:
         found = find_result(catalog, result)
     shown = plain(found) | {"answered": found.answered._asdict(), "current": found.current._asdict()}
@@ -97,7 +92,6 @@ def show(settings: Settings, result: ResultArgument) -> None:
 
 
 @app.command("export")
-@command
 def export(
     settings: Settings,
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="File to write: .csv, .json or .parquet.")],
@@ -107,8 +101,6 @@ def export(
 
     Example: rig results export june.csv --since 2026-06-01 --before 2026-07-01 --bench sim
     """
-    from rig.catalog.exchange.tables import RESULTS, TableFormat, write_rows
-
     form, found = TableFormat.of(target), _find(settings, filters)
     write_rows(target, form, RESULTS, (result.as_row().model_dump() for result in found))
     settings.say(
@@ -118,7 +110,6 @@ def export(
 
 
 @app.command("correct")
-@command
 def correct(
     settings: Settings,
     result: ResultArgument,
@@ -134,8 +125,6 @@ def correct(
 
     Example: rig results correct 12 --object mug-star --reason "read the label" --bench sim
     """
-    from rig.catalog.results import correct as correct_result
-
     with settings.open_catalog() as catalog:
         now = correct_result(
             *(catalog, result), reason=reason, object_name=name, unknown=unknown, sample=sample, operator=operator
@@ -152,9 +141,6 @@ def log(settings: Settings, since: SinceOption = None) -> None:
 
     Example: rig log --since 7d --bench sim
     """
-    from rig.catalog.log import shown
-    from rig.cli.ui.present import print_table
-
     begin = _time(since, "--since")
     with settings.open_catalog(read_only=True) as catalog:
         entries = catalog.log(since=begin)
@@ -188,9 +174,7 @@ def _detail(key: str, value: Any) -> str:
     return f"{name} {short(', '.join(map(str, value)) if isinstance(value, list) else str(value), _LONGEST_DETAIL)}"
 
 
-def _find(settings: Settings, filters: Filters) -> "list[Result]":
-    from rig.catalog.records import RecordedOutcome
-    from rig.catalog.results import ResultFilter, find_results
+def _find(settings: Settings, filters: Filters) -> list[Result]:
 
     wanted = ResultFilter(
         sample=filters["sample"],
@@ -219,7 +203,7 @@ def _time(text: str | None, option: str) -> datetime | None:
     return when.replace(tzinfo=UTC) if when.tzinfo is None else when
 
 
-def _words(answer: "Answer") -> str:
+def _words(answer: Answer) -> str:
     """Return an answer for a table: "mug-white", "ambiguous (mug-white?)", "unknown"."""
     if answer.outcome == "ambiguous":
         return f"ambiguous ({answer.object_name}?)"

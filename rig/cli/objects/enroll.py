@@ -2,17 +2,23 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from rig.cli.ui.command import command
+from rig.cli.ui.desk import CommandDesk
+from rig.cli.ui.live import LiveView
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do, in_words
-
-if TYPE_CHECKING:
-    from rig.events.events import Event
+from rig.events.events import Accepted, Enrolled, Event, Started
+from rig.jobs.enroll import enroll as enroll_job
+from rig.jobs.enroll import enroll_list
+from rig.jobs.enroll import retake as retake_job
+from rig.motion.move import MotionTimes
+from rig.plans.estimate import TimeLeft
+from rig.plans.tray import read_tray
 
 
 @command
@@ -69,16 +75,6 @@ def enroll(
 
     Example: rig enroll mug-white --bench sim --retake 6
     """
-    from rig.cli.ui.desk import CommandDesk
-    from rig.cli.ui.live import LiveView
-    from rig.events.events import Accepted, Enrolled, Started
-    from rig.jobs.enroll import enroll as enroll_job
-    from rig.jobs.enroll import enroll_list
-    from rig.jobs.enroll import retake as retake_job
-    from rig.motion.move import MotionTimes
-    from rig.plans.estimate import TimeLeft
-    from rig.plans.tray import read_tray
-
     again = [number - 1 for number in retake or ()]
     options = {"label": label, "note": note, "resume": resume, "replace": replace, "views": views, "fly": fly}
     _check(name, tray, retake=retake, **options)
@@ -86,7 +82,7 @@ def enroll(
     how: dict[str, Any] = {"views": views, "fly": fly or None, "ask": not yes}
     stored_views = enrolled = 0
 
-    def show(event: "Event") -> None:
+    def show(event: Event) -> None:
         nonlocal stored_views, enrolled
         if isinstance(event, Started):
             view.left = TimeLeft(MotionTimes(desk.bench.config), event.angles_deg, in_motion=event.in_motion)

@@ -4,18 +4,22 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from hbr.evaluation.experiment import Experiment
+from hbr.evaluation.photographs import Dataset, load_coil
+from rig.catalog.describing import known_descriptor
+from rig.catalog.jobs import JobProgress
 from rig.cli.ui.command import command
 from rig.cli.ui.options import JobsOption
+from rig.cli.ui.present import ProgressBar, console
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from hbr.evaluation.experiment import Experiment
-    from hbr.evaluation.photographs import Dataset
+from rig.evaluation.experiments import DEFAULT, load_catalog, load_experiment
+from rig.evaluation.run import own_folder, run_experiment, write_results
+from rig.evaluation.tables import contest_sentences, cost_sentence, tables
 
 
 @command
@@ -62,13 +66,6 @@ def evaluate(
 
     Example: rig eval paper --data coil-100 --noise mb
     """
-    from rig.catalog.describing import known_descriptor
-    from rig.catalog.jobs import JobProgress
-    from rig.cli.ui.present import ProgressBar, console
-    from rig.evaluation.experiments import DEFAULT, load_experiment
-    from rig.evaluation.run import own_folder, run_experiment, write_results
-    from rig.evaluation.tables import contest_sentences, cost_sentence, tables
-
     if data is None and Path(experiment).is_dir():
         experiment, data = DEFAULT, Path(experiment)
     # The experiment, with what the options replace.
@@ -116,9 +113,7 @@ def evaluate(
     print(f"Written: {folder}/results.json, results.csv, and the figures if there are any.", file=sys.stderr)
 
 
-def _dataset(settings: Settings, folder: Path | None, experiment: "Experiment") -> "Dataset":
-    from hbr.evaluation.photographs import load_coil
-    from rig.evaluation.experiments import load_catalog
+def _dataset(settings: Settings, folder: Path | None, experiment: Experiment) -> Dataset:
 
     if folder is None:
         with settings.open_catalog(read_only=True) as catalog:

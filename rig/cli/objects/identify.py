@@ -7,9 +7,14 @@ from typing import Annotated
 
 import typer
 
+from hbr import Outcome
 from rig.cli.ui.command import command
+from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_UNKNOWN
+from rig.cli.ui.live import LiveView
 from rig.cli.ui.settings import Settings
+from rig.events.events import Identified
+from rig.jobs.identify import identify as identify_job
 
 
 @command
@@ -58,12 +63,6 @@ def identify(
 
     Example: rig identify --watch --scan --operator "A. Silva" --bench sim
     """
-    from hbr import Outcome
-    from rig.cli.ui.desk import CommandDesk
-    from rig.cli.ui.live import LiveView
-    from rig.events.events import Identified
-    from rig.jobs.identify import identify as identify_job
-
     with ExitStack() as beside, LiveView(settings) as view:
         desk = CommandDesk(settings, view.hide)
         if watch:

@@ -1,18 +1,25 @@
 """`rig replay` and `rig report`: read what `rig identify --save-run` has saved, and what the bench keeps of moves."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
 from rig.cli.ui.command import command
+from rig.cli.ui.live import LiveView
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ReplayMismatch, RunIncomplete, UsageError
+from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import counted, short
-
-if TYPE_CHECKING:
-    from rig.search.saved_run import SavedRun
+from rig.events.wording import problem_line
+from rig.motion.traces import stored
+from rig.report import write_report
+from rig.report.motion import motion_report
+from rig.report.report import run_report
+from rig.safety.saved_state import FileStore
+from rig.search.replay import check as check_run
+from rig.search.saved_run import SavedRun, load_run
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")]
 SHOWN: Final = 3
@@ -31,14 +38,10 @@ def replay(
 
     Example: rig replay runs/1 --check
     """
-    from rig.search.saved_run import load_run
-
     saved = load_run(run)
     if check:
         _check(settings, saved)
         return
-    from rig.cli.ui.live import LiveView
-    from rig.events.wording import problem_line
 
     if not settings.json:
         about, objects = saved.about, counted(len(saved.views.object_names), "enrolled object")
@@ -66,16 +69,11 @@ def report(
 
     Example: rig report runs/1 --out run-1.html
     """
-    from rig.report import write_report
-
     if motion == (run is not None):
         raise UsageError("One report at a time is written.", next_step="Give the folder of a saved run, or --motion.")
     if run is None:
         page, path = _motion(settings), out or Path("motion.html")
     else:
-        from rig.report.report import run_report
-        from rig.search.saved_run import load_run
-
         page, path = run_report(load_run(run)), out or run / "report.html"
     write_report(path, page)
     settings.say(f"Report: {path}", {"report": str(path)})
@@ -83,10 +81,6 @@ def report(
 
 def _motion(settings: Settings) -> str:
     """Return the page about the last moves of the bench, which may be in use."""
-    from rig.motion.traces import stored
-    from rig.report.motion import motion_report
-    from rig.safety.saved_state import FileStore
-
     config, bench = settings.load(), settings.bench_name
     moves = stored(FileStore(config.state_path(bench)))
     if not moves:
@@ -97,12 +91,10 @@ def _motion(settings: Settings) -> str:
     return motion_report(moves, bench=bench, quiet_dps=config.table.quiet_dps)
 
 
-def _check(settings: Settings, saved: "SavedRun") -> None:
-    from rig.core.json_form import plain
-    from rig.search.replay import check
+def _check(settings: Settings, saved: SavedRun) -> None:
 
     with saved.damage():
-        found = check(saved)
+        found = check_run(saved)
     done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."
     if found.differences:
         listed = [str(one) for one in found.differences]

@@ -50,10 +50,6 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
                 except RigError as error:
                     show_error(error, settings)
                     raise typer.Exit(error.exit_code) from None
-                except RuntimeError as error:  # Python 3.11 makes it of a signal in __set_name__, as in many imports
-                    if isinstance(error.__cause__, KeyboardInterrupt | SystemExit):
-                        raise error.__cause__ from None
-                    raise
         except BrokenPipeError:  # the reader of a pipe, such as head, has ended
             discard(sys.stdout)
             raise typer.Exit(EXIT_BY_SIGNAL + signal.SIGPIPE) from None
@@ -64,6 +60,17 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
     show_parameters(run, [context, *own, *options_of(CommonOptions)])
     return run
+
+
+class Group(typer.Typer):
+    """Commands below one name; each takes `Settings` and the common options, as by `command`."""
+
+    def __init__(self, help: str | None) -> None:
+        super().__init__(help=help, no_args_is_help=True)
+
+    def command(self, name: str | None = None, **extra: Any) -> Callable[[Any], Any]:
+        register = super().command(name, **extra)
+        return lambda function: register(command(function))
 
 
 @contextmanager

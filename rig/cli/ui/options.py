@@ -8,6 +8,8 @@ from typing import Annotated, Any, TypedDict, get_args, get_type_hints
 
 import typer
 
+from rig.core.errors import UsageError, os_errors_as
+
 
 class CommonOptions(TypedDict):
     """The options of every command, given before or after it."""
@@ -62,3 +64,18 @@ def show_parameters(command: Callable[..., Any], parameters: Sequence[inspect.Pa
     """Let Typer take these parameters for those of a command: it reads the signature and the annotations."""
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {one.name: one.annotation for one in parameters}
+
+
+def check_new(file: Path, suffix: str) -> None:
+    """Raise `UsageError` if a file has another suffix, or exists."""
+    if file.suffix.lower() != suffix:
+        raise UsageError(f"{file} does not end with {suffix}.", next_step=f"Give a name that ends with {suffix}.")
+    if file.exists():
+        raise UsageError(f"{file} exists.", next_step="Give another name.")
+
+
+def write_new(file: Path, content: bytes) -> None:
+    """Write a file that does not exist yet. Raises `UsageError` if that is not possible."""
+    what, step = f"{file} cannot be written.", "Choose another folder."
+    with os_errors_as(UsageError, what, next_step=step), file.open("xb") as output:
+        output.write(content)

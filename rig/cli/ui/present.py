@@ -1,25 +1,22 @@
-"""Tables, sizes and progress bars on a terminal.
-
-This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
-"""
+"""Tables, sizes and progress on a terminal."""
 
 import os
 import sys
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import AbstractContextManager, closing
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 import typer
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
 from rich.segment import Segment
 
+from rig.catalog.jobs import JobProgress, finished
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
-
-if TYPE_CHECKING:
-    from rig.catalog.jobs import JobProgress
 
 _T = TypeVar("_T")
 _PIPE_COLUMNS: Final = 240  # no row of a table is cut for a program that reads it
@@ -61,9 +58,6 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     """A progress bar on stderr, shown from its first call on; only its notes if stderr is not a terminal."""
 
     def __init__(self, title: str) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-        from rich.progress import Progress as RichProgress
-
         self._bar = RichProgress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -79,7 +73,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def __call__(self, at: "JobProgress") -> None:
+    def __call__(self, at: JobProgress) -> None:
         """Show how much is done."""
         self._bar.start()
         self._bar.start_task(self._task)
@@ -90,10 +84,8 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         self._bar.console.print(text, markup=False, highlight=False, soft_wrap=not self._bar.console.is_terminal)
 
 
-def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted: str) -> _T:
+def run_job(title: str, job: Generator[JobProgress, None, _T], *, interrupted: str) -> _T:
     """Run a job of the catalog with a progress bar on stderr and return its result; Ctrl+C prints ``interrupted``."""
-    from rig.catalog.jobs import finished
-
     try:
         with closing(job), ProgressBar(title) as progress:
             return finished(job, progress)
@@ -109,3 +101,9 @@ def size_words(size: float) -> str:
             return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
         size /= 1000
     raise AssertionError
+
+
+def show_progress(text: str) -> None:
+    """Show progress at a terminal; the next line replaces it."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{neutral(text[:78])}\r", end="", file=unguarded(sys.stderr), flush=True)

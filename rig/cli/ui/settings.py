@@ -5,6 +5,7 @@ This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must 
 
 import json
 import sys
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,12 +17,13 @@ from rig.core.masking import masked
 from rig.core.next_steps import Do, in_words
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
 
     from rig.bench import Bench
     from rig.catalog import Catalog
     from rig.config import RigConfig
     from rig.config.catalog_place import CatalogPlace
+    from rig.doctor.context import DoctorContext
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,19 @@ class Settings:
         if tell and bench.calibration_steps:
             print(in_words(bench.calibration_steps), file=sys.stderr)
         return bench
+
+    @contextmanager
+    def open_parts(self, *, default: bool = False) -> "Iterator[DoctorContext]":
+        """Yield the bench with its devices closed, for the doctor; ``default`` ignores the configuration file."""
+        from rig.config import RigConfig
+        from rig.doctor.context import open_context
+
+        config = RigConfig() if default else self.load()
+        file_options = ("--config", str(self.config)) if self.config else ()
+        options = tuple(self.selection()) + tuple(word for one in self.overrides for word in ("--set", one))
+        name = self.bench or config.default_bench
+        with open_context(name, config, seed=self.seed, options=options, file_options=file_options) as context:
+            yield context
 
     def open_catalog(self, *, create: bool = False, read_only: bool = False) -> "Catalog":
         """Open the bench's catalog, but not to enroll."""

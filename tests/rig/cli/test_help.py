@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rig.cli.main import SECTIONS, _with_commands_for, app
+from rig.cli.main import PLACES, SECTIONS, app
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.core.errors import RigError
 
@@ -91,15 +91,6 @@ def test_terminal_without_unicode_shows_question_marks(tmp_path):
     assert "(asked 20.00?)" in done.stdout
 
 
-def test_start_builds_only_the_called_command():
-    for one in (*app.registered_commands, *app.registered_groups):
-        assert list(typer.main.get_command(_with_commands_for([one.name, "--help"])).commands) == [one.name]
-    for arguments in ([], ["--help"]):
-        assert not typer.main.get_command(_with_commands_for(arguments)).commands
-    for arguments in (["--bench", "sim", "status"], ["gotoo"], ["--help", "--no-color"]):
-        assert _with_commands_for(arguments) is app
-
-
 def test_help_begins_with_the_ten_commands_of_a_day_and_names_every_command_once():
     shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "120"}).output
     sections = re.findall(r"^([A-Z][\w -]+):$", shown, re.MULTILINE)
@@ -107,10 +98,22 @@ def test_help_begins_with_the_ten_commands_of_a_day_and_names_every_command_once
     assert sections[0] == "Start here"
     assert len(SECTIONS["Start here"]) == 10
     listed = re.findall(r"^  ([a-z][a-z-]+) +[A-Z]", shown, re.MULTILINE)
-    assert listed == [name for names in SECTIONS.values() for name in names]
+    assert listed == list(PLACES)
 
 
 def test_help_of_a_group_cuts_no_sentence():
-    for group in (name for names in SECTIONS.values() for name, one in names.items() if isinstance(one, typer.Typer)):
+    for group in {words[0] for words in COMMANDS if len(words) > 1}:
         shown = CliRunner().invoke(app, [group, "--help"], env={"COLUMNS": "80"}).output
         assert not re.search(r"\w\.\.\.$", shown, re.MULTILINE), group
+
+
+def test_names_of_commands_are_completed_without_importing_them():
+    code = (
+        "import sys; sys.argv = ['rig']\n"
+        "from rig.cli.main import main\n"
+        "try: main()\n"
+        "finally: print('\\nnumpy' if 'numpy' in sys.modules else '')\n"
+    )
+    asked = {**os.environ, "_RIG_COMPLETE": "complete_bash", "COMP_WORDS": "rig s", "COMP_CWORD": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=asked, capture_output=True, text=True)
+    assert done.stdout.split() == ["status", "stop", "serve", "setup", "snapshot", "servo", "sim-bench"]

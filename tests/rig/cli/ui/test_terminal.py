@@ -16,10 +16,9 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
-from rig.cli.bench.doctor import show_progress
 from rig.cli.main import app
 from rig.cli.ui.command import show_error
-from rig.cli.ui.present import console
+from rig.cli.ui.present import console, show_progress
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import guarded_output
 from rig.core.control_characters import neutral
@@ -146,11 +145,14 @@ def test_unexpected_errors_and_broken_plug_ins_are_neutral(tmp_path):
         "@command\ndef go(settings: Settings) -> None:\n    raise ZeroDivisionError('\\x1b]0;raised\\x07')\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    done = subprocess.run([*RIG, "raising"], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+    done = subprocess.run([*RIG, "broken"], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
     assert is_safe(done.stdout + done.stderr)
     assert "The plug-in broken_plugin:go cannot be loaded" in done.stderr
     assert "\\u001b[2Jbroken" in done.stderr
+    done = subprocess.run([*RIG, "raising"], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert is_safe(done.stdout + done.stderr)
     assert "ZeroDivisionError: \\u001b]0;raised\\u0007" in done.stderr
     assert "Error 100 (internal error).\nNext step: " in done.stderr
 
