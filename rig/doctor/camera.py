@@ -1,9 +1,9 @@
 """Check the camera: its mode, its locks, and the age and quality of its frames."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,28 +12,18 @@ from numpy.typing import NDArray
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
 from rig.core.next_steps import Do, NextStep, SomeSteps
-from rig.devices.camera import CameraLocks
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.v4l2 import choose_mode
-from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode
+from rig.doctor.examination import DoctorContext
+from rig.doctor.finding import Finding, bad, fine, warning
 from rig.safety.saved_state import FileStore
 from rig.views.capture import ImageQuality, rejection_text
 
-_MAINS = {0.0: "off", 1.0: "50 Hz", 2.0: "60 Hz", 3.0: "automatic"}
-"""Values of V4L2_CID_POWER_LINE_FREQUENCY (Linux, `v4l2-controls.h`)."""
-_RATE = {True: "varies with the light", False: "constant"}
-_LOCKS: dict[str, tuple[str, Callable[[Any], str]]] = {
-    "exposure": ("exposure_us", lambda us: f"{us / 1e3:g} ms"),
-    "white balance": ("white_balance_k", "{:g} K".format),
-    "gain": ("gain", "{:g}".format),
-    "focus": ("focus", "{:g}".format),
-    "sharpness": ("sharpness", "{:g}".format),
-    "backlight compensation": ("backlight_compensation", "{:g}".format),
-    "power-line frequency": ("power_line_frequency", lambda value: _MAINS.get(value, f"{value:g}")),
-    "frame rate": ("dynamic_frame_rate", lambda varies: _RATE[varies]),
-}
-"""The attribute of `CameraLocks` for each name in words, and how its value is written."""
+LOCKABLE = (
+    *("exposure_us", "white_balance_k", "gain", "focus", "sharpness"),
+    *("backlight_compensation", "power_line_frequency"),
+)
+"""Settings that a camera reports, by their keys in ``[camera]``."""
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
@@ -49,8 +39,8 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
         identity = source.identity
         context.identities["camera"] = asdict(identity)
         mode = {"name": identity.name, "width": identity.width, "height": identity.height, "fps": identity.fps}
-        yield FindingCode.CAMERA(**mode)
-        yield FindingCode.TIME_BASE(time_base=source.time_base.value)
+        yield fine("camera", "{name}: {width}x{height} at {fps:.3g} frames/s", **mode)
+        yield fine("time_base", "frames timed by {time_base} exposure", time_base=source.time_base.value)
         yield from _mode(context, source)
         yield from _locks(context, source)
         yield from _frames(context, source)
@@ -88,63 +78,49 @@ def open_camera(context: DoctorContext, *, refocus: bool = False) -> OpenCvCamer
 
 def _mode(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     wanted = context.config.camera
-    nearest = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps, wanted.fourcc)
+    text = "the camera does not offer {wanted}; nearest: {nearest}"
     size = f"{wanted.width}x{wanted.height} at {wanted.fps:.3g} frames/s"
+    nearest = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps, wanted.fourcc)
     if nearest is None:
         usable = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps)
         if usable is not None:
             fix = Do.SET_KEY(key="camera.fourcc", value="none")
-            yield FindingCode.MODE_NOT_OFFERED(fix, wanted=f"{size} ({wanted.fourcc})", nearest=usable)
-        return
-    if (nearest.width, nearest.height) != (wanted.width, wanted.height) or 0 < nearest.fps < 0.9 * wanted.fps:
-        yield FindingCode.MODE_NOT_OFFERED(Do.SETUP(), wanted=size, nearest=nearest)
+            yield warning("mode_not_offered", text, fix, wanted=f"{size} ({wanted.fourcc})", nearest=usable)
+    elif (nearest.width, nearest.height) != (wanted.width, wanted.height) or 0 < nearest.fps < 0.9 * wanted.fps:
+        yield warning("mode_not_offered", text, Do.SETUP(), wanted=size, nearest=nearest)
 
 
 def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     locks = source.read_locks()
     fix = f"v4l2-ctl --list-ctrls-menus -d {context.config.camera.source}"
+    rejected = []
     for one in source.rejected_settings:
+        # The driver requests the exposure in units of 100 µs.
+        rejected.append("exposure_us" if one.setting == "exposure_100us" else one.setting)
         found = {"setting": one.setting, "requested": one.asked, "reported": one.reported}
         steps: SomeSteps = fix
         if one.reported == NO_CONTROL:
             steps = (
                 "Views of one object differ if the light changes: keep it constant, or use a camera with this control.",
-                Do.SET_KEY(key=f"camera.{_key(one.setting)}", value="none"),
+                Do.SET_KEY(key=f"camera.{rejected[-1]}", value="none"),
             )
-        yield FindingCode.SETTING_REJECTED(steps, **found)
-    wanted = context.config.camera
-    not_locked = [
-        name
-        for name, loose in (
-            ("exposure", locks.auto_exposure),
-            ("white balance", locks.auto_white_balance),
-            ("gain", locks.gain is not None and wanted.gain is None),
-            ("focus", locks.autofocus),
-            ("frame rate", locks.dynamic_frame_rate),
+        yield warning(
+            "setting_rejected", "{setting}: requested {requested}, the camera reports {reported}", steps, **found
         )
-        if loose
-    ]
+    is_loose = {
+        "exposure_us": locks.auto_exposure,
+        "white_balance_k": locks.auto_white_balance,
+        "gain": locks.gain is not None and context.config.camera.gain is None,
+        "focus": locks.autofocus,
+        "frame rate": locks.dynamic_frame_rate,
+    }
+    not_locked = [name for name, loose in is_loose.items() if loose]
     if not_locked:
-        yield FindingCode.NOT_LOCKED(fix, settings=not_locked)
-    rejected = {_key(one.setting) for one in source.rejected_settings}
-    locked = [
-        f"{name} {value}"
-        for name, value in lock_words(locks).items()
-        if name not in not_locked and _LOCKS[name][0] not in rejected
-    ]
-    if locked:
-        yield FindingCode.LOCKED(settings=locked)
-
-
-def _key(setting: str) -> str:
-    """Return the key of a setting that the driver has requested."""
-    return "exposure_us" if setting == "exposure_100us" else setting
-
-
-def lock_words(locks: CameraLocks) -> dict[str, str]:
-    """Return the settings that the camera reports, by name: "exposure": "10 ms"."""
-    values = {name: getattr(locks, attribute) for name, (attribute, _) in _LOCKS.items()}
-    return {name: _LOCKS[name][1](value) for name, value in values.items() if value is not None}
+        text = "{settings} not locked: views of one object may differ"
+        yield warning("not_locked", text, fix, settings=not_locked)
+    known = {name: getattr(locks, name) for name in LOCKABLE if name not in (*not_locked, *rejected)}
+    if locked := [f"{name} {value:.10g}" for name, value in known.items() if value is not None]:
+        yield fine("locked", "locked and read back: {settings}", settings=locked)
 
 
 def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
@@ -168,25 +144,38 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     levels = [each.mean_level for each in seen]
     evidence: dict[str, Any] = {"frame_age_ms": 1e3 * max(ages), "frames_per_s": rate, "mean_levels": levels}
     if max(levels) < context.config.view.min_mean:
-        yield FindingCode.BLACK(mean_level=max(levels), **evidence)
+        fix: SomeSteps = ("Take the lens cap off and switch the light on, then", Do.DOCTOR())
+        yield bad("black", "black: mean level {mean_level:.1f} of 255", fix, mean_level=max(levels), **evidence)
         return
     if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
-        yield FindingCode.CAMERA_FROZEN(frames=len(frames), **evidence)
+        fix = ("Unplug the camera, plug it in again, then", Do.DOCTOR())
+        yield bad("camera_frozen", "frozen: {frames} frames are identical", fix, frames=len(frames), **evidence)
         return
+    text = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second"
     if max(ages) > MAX_AGE_S:
-        yield FindingCode.LATE_FRAMES(**evidence)
+        yield warning("late_frames", f"{text}: too old", "Try another USB port, or reduce camera.width", **evidence)
     elif rate < 0.6 * source.identity.fps:
-        yield FindingCode.FEW_FRAMES(fps=source.identity.fps, **evidence)
+        fix = "Try another USB port, or reduce camera.exposure_us or camera.fps"
+        yield warning("few_frames", f"{text}, not {{fps:.3g}}", fix, fps=source.identity.fps, **evidence)
     else:
-        yield FindingCode.FRAMES(**evidence)
+        yield fine("frames", text, **evidence)
     yield from _flicker(source, frames, np.array(times_ns), evidence)
     # Would an enrollment accept this view?
     quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
         texts = [rejection_text(reason, seen[-1]) for reason in reasons]
-        yield FindingCode.VIEW_REJECTED(reasons=texts, codes=reasons, **quality)
+        fix = (
+            "Check light, exposure and focus (an empty table may look blurred). The limits are in [view].",
+            Do.SHOW_CONFIGURATION(),
+        )
+        text = "a view would be rejected now: {reasons}"
+        yield warning("view_rejected", text, fix, reasons=texts, codes=reasons, **quality)
     else:
-        yield FindingCode.VIEW_ACCEPTED(**quality)
+        text = (
+            "a view would be accepted now: mean level {mean_level:.0f}, sharpness {sharpness:.0f}, "
+            "{saturated_share:.1%} saturated"
+        )
+        yield fine("view_accepted", text, **quality)
 
 
 # -- lamps that flicker with the mains: the bands that they leave in the images of a rolling shutter -------------------
@@ -202,21 +191,16 @@ _CYCLES = np.arange(0.0, 8.01, 0.125)
 _BLOCKS = 48  # six for each band at most; more blocks are noisier
 
 
-class MainsFlicker(NamedTuple):
-    """Flicker at twice the mains frequency; ``depth`` is its amplitude as a share of the mean level."""
-
-    mains_hz: float
-    depth: float
-
-
 def whole_periods_us(mains_hz: float, wanted_us: float) -> float:
     """Return the exposure time without bands that is nearest to ``wanted_us``: whole periods of the lamp."""
     period_us = 1e6 / (2 * mains_hz)
     return float(round(max(round(wanted_us / period_us), 1) * period_us))
 
 
-def mains_flicker(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64]) -> MainsFlicker | None:
-    """Return the flicker of a still scene; None if there is none.
+def mains_flicker(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64]) -> tuple[float, float] | None:
+    """Return the mains frequency, in Hz, with which the light of a still scene flickers, and the depth of the bands.
+
+    The depth is their amplitude as a share of the mean level. None if there are no bands.
 
     The row at the share y of the height is exposed later by y times the readout. So a lamp with the frequency f adds
     cos(2π (f t + c y)) to the image at time t, with c bands. Both are fitted to the changes of each row. Bands that
@@ -233,14 +217,13 @@ def mains_flicker(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64]) 
     if power == 0.0:
         return None
     bands = np.exp(-2j * np.pi * np.outer((np.arange(_BLOCKS) + 0.5) / _BLOCKS, _CYCLES))
-    best = MainsFlicker(0.0, 0.0)
+    depth, found_hz = 0.0, 0.0
     for mains_hz in MAINS_HZ:
         phases = _phases(mains_hz, times_ns)
         if (weight := float((np.abs(phases) ** 2).mean())) >= _STANDS:
             fitted = np.abs(phases @ changes @ bands).max() / (count * _BLOCKS * weight)
-            best = max(best, MainsFlicker(mains_hz, 2 * float(fitted)), key=lambda one: one.depth)
-    explained = best.depth**2 / 2 / power
-    return best if best.depth >= MIN_DEPTH and explained >= _MIN_EXPLAINED else None
+            depth, found_hz = max((depth, found_hz), (2 * float(fitted), mains_hz))
+    return (found_hz, depth) if depth >= MIN_DEPTH and depth**2 / 2 / power >= _MIN_EXPLAINED else None
 
 
 def standing_mains_hz(times_ns: NDArray[np.int64]) -> tuple[float, ...]:
@@ -266,17 +249,22 @@ def _flicker(
     lamp = mains_flicker(np.array([frame[:, ::2, 1].mean(axis=1) for frame in frames]), times_ns)
     reported_us = source.read_locks().exposure_us
     exposure_us = reported_us or 1e4
+    # Whole periods of the lamp give each row the same light.
+    none = "an exposure of whole periods of the lamp has none"
     if lamp is not None:
-        fix = _exposure_without_bands(lamp.mains_hz, exposure_us)
-        yield FindingCode.MAINS_FLICKER(fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
+        text = f"the lamps flicker with the mains ({{mains_hz:.0f}} Hz): bands of {{depth:.0%}} in the images; {none}"
+        mains_hz, depth = lamp
+        yield warning("mains_flicker", text, _set_exposure(mains_hz, exposure_us), mains_hz=mains_hz, depth=depth)
     elif spread > MAX_FLICKER:
-        yield FindingCode.FLICKER(spread=spread, seconds=SPACED * SPACING_S, **evidence)
+        text = "the light changes by {spread:.0%} within {seconds:.0f} s"
+        fix = ("Use a lamp that does not flicker, and keep daylight and shadows away, then", Do.DOCTOR())
+        yield warning("flicker", text, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
     else:
+        text = "bands of lamps at {mains_hz:.0f} Hz mains would stand still in the images, and are not checked; " + none
         for hz in standing_mains_hz(times_ns):
             if reported_us is None or abs(whole_periods_us(hz, exposure_us) - exposure_us) > EXPOSURE_STEP_US:
-                fix = _exposure_without_bands(hz, exposure_us)
-                yield FindingCode.STANDING_FLICKER_NOT_CHECKED(fix, mains_hz=hz)
+                yield fine("standing_flicker_not_checked", text, _set_exposure(hz, exposure_us), mains_hz=hz)
 
 
-def _exposure_without_bands(mains_hz: float, exposure_us: float) -> NextStep:
+def _set_exposure(mains_hz: float, exposure_us: float) -> NextStep:
     return Do.SET_KEY(key="camera.exposure_us", value=f"{whole_periods_us(mains_hz, exposure_us):g}")

@@ -1,28 +1,23 @@
 """All checks of a bench, in their order; and those of its stored data: the catalog and the calibrations."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from typing import Any
 
 from sqlalchemy import select
 
-from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
-from rig.calibrations.store import BenchCalibration
+from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus
 from rig.catalog import Catalog
 from rig.catalog.facts import View
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 from rig.doctor import computer
 from rig.doctor.camera import camera
-from rig.doctor.context import DoctorContext
-from rig.doctor.examination import Check
-from rig.doctor.finding import Finding, FindingCode, graded, of_error
+from rig.doctor.examination import Check, DoctorContext
+from rig.doctor.finding import Finding, bad, fine, graded, of_error, warning
 from rig.doctor.imu import imu
 from rig.doctor.servo import servo
-from rig.views.stream import exposed_before_stamp_ns
 
 IMAGES = 24  # number of images that are verified; `rig catalog verify` verifies all
-
-WANTED = {"imu.scale": "the gyro's scale may be off by a percent"}
-"""Calibrations that every bench should have, and the consequence of a missing one."""
 
 
 def catalog(context: DoctorContext) -> Iterator[Finding]:
@@ -30,15 +25,18 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
     place = context.config.catalog_place(context.bench)
     path = place if place.url is not None else place.path
     if not place.may_exist():
-        yield FindingCode.NO_CATALOG(path=path)
+        yield fine("no_catalog", "none yet in {path}; the first enrollment creates it", path=path)
         return
     with Catalog.open(place, clock=context.computer.clock, read_only=True) as opened:
+        # The database: its own check, then the digests of the objects.
         with opened.database.read() as transaction:
-            checked = opened.database.damage(transaction)
-        if checked:
-            yield FindingCode.DATABASE_DAMAGED(path=path, damage=checked)
+            damage = opened.database.damage(transaction)
+        if damage:
+            text = "{path}: the database is damaged: {damage}"
+            yield bad("database_damaged", text, Do.VERIFY_CATALOG(), path=path, damage=damage)
         if (changed := opened.damage()) is not None:
             raise changed
+        # Some images: all of a large catalog would take hours.
         objects, chosen = opened.objects(), _some_images(opened)
         broken = []
         for image in chosen:
@@ -47,14 +45,17 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
             except CatalogError as error:
                 broken.append(error)
         if broken:
+            text = "{broken} of {images} verified images are damaged: {first}"
             found = {"broken": len(broken), "images": len(chosen), "first": broken[0].what}
-            yield FindingCode.IMAGES_DAMAGED(**found)
+            yield bad("images_damaged", text, Do.VERIFY_CATALOG(), **found)
         unfinished = [item.name for item in objects if item.unfinished_views is not None]
         if unfinished:
-            yield FindingCode.UNFINISHED(Do.CONTINUE_ENROLLMENT(name=unfinished[0]), objects=unfinished)
-        if not checked and not broken:
+            fix = Do.CONTINUE_ENROLLMENT(name=unfinished[0])
+            yield warning("unfinished", "unfinished enrollments: {objects}", fix, objects=unfinished)
+        if not damage and not broken:
+            text = "{path}: {objects} objects, {views} views; database undamaged, {images} images verified"
             counts = {"objects": len(objects), "views": sum(item.views for item in objects), "images": len(chosen)}
-            yield FindingCode.CATALOG(path=path, **counts)
+            yield fine("catalog", text, path=path, **counts)
 
 
 def _some_images(opened: Catalog) -> list[str]:
@@ -67,41 +68,25 @@ def _some_images(opened: Catalog) -> list[str]:
 
 def calibrations(context: DoctorContext) -> Iterator[Finding]:
     """Check that calibrations of this bench's devices exist and have not expired."""
-    store = CalibrationStore(context.config.calibration_path(context.bench))
-    device = apparatus(context.bench, context.identities, context.config, {})
-    calibrations = store.on_bench(device, context.computer.clock.utc())
+    config = context.config
+    store = CalibrationStore(config.calibration_path(context.bench))
+    known = store.on_bench(apparatus(context.bench, context.identities, config, {}), context.computer.clock.utc())
     for error in store.unreadable:
         yield of_error(error)
-    for calibration in calibrations:
-        found = {
-            "calibration": calibration,
-            "name": calibration.result.name,
-            "status": calibration.status,
-            "id": calibration.result.id,
-        }
-        level = graded(bad=False, warning=calibration.status is not CalibrationStatus.IN_FORCE)
-        yield FindingCode.CALIBRATION(calibration.repetition, level, **found)
-    yield _camera_delay(context, calibrations)
-    for name, without in WANTED.items():
-        if name not in {calibration.result.name for calibration in calibrations} and not _configured(context, name):
-            fix = Do.CALIBRATE(name=name.partition(".")[0])
-            yield FindingCode.NEVER_CALIBRATED(fix, name=name, consequence=without)
-
-
-def _camera_delay(context: DoctorContext, calibrations: Iterable[BenchCalibration]) -> Finding:
-    """Return the time that views wait for a delay inside the camera, which its time stamps do not show."""
-    in_force = (one.result for one in calibrations if one.status is CalibrationStatus.IN_FORCE)
-    config, _ = apply_results(context.config, in_force)
-    if config.camera_time.offset_ms is None:
-        return FindingCode.CAMERA_DELAY_UNKNOWN()
-    delay_ms = exposed_before_stamp_ns(config) * 1e-6
-    found = config.camera_time.model_dump()
-    return FindingCode.CAMERA_DELAY(delay_ms=delay_ms, **found)
-
-
-def _configured(context: DoctorContext, key: str) -> bool:
-    section, _, name = key.partition(".")
-    return name in getattr(context.config, section).model_fields_set
+    in_force = set()
+    for one in known:
+        found: dict[str, Any] = {"calibration": one, "name": one.result.name, "status": one.status, "id": one.result.id}
+        is_in_force = one.status is CalibrationStatus.IN_FORCE
+        yield graded("calibration", "{calibration}", one.repetition, is_warning=not is_in_force, **found)
+        in_force |= {one.result.name} if is_in_force else set()
+    if config.camera_time.offset_ms is None and "camera.time" not in in_force:
+        text = (
+            "a delay inside the camera does not show in its time stamps; a calibration measures it (the table rotates)"
+        )
+        yield fine("camera_delay_unknown", text, Do.CALIBRATE(name="camera-time"))
+    if "scale" not in config.imu.model_fields_set and not any(one.result.name == "imu.scale" for one in known):
+        text = "{name} was never calibrated: the gyro's scale may be off by a percent"
+        yield warning("never_calibrated", text, Do.CALIBRATE(name="imu"), name="imu.scale")
 
 
 CHECKS = (

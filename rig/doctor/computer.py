@@ -3,14 +3,15 @@
 import os
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.camera_node import camera_node
 from rig.core.json_form import plain
-from rig.core.next_steps import Do, SomeSteps
+from rig.core.next_steps import Do, NextStep, SomeSteps
 from rig.devices.dynamixel.port import GUARDIAN
-from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, graded
+from rig.doctor.examination import DoctorContext
+from rig.doctor.finding import Finding, bad, fine, graded, warning
 from rig.safety.saved_state import FileStore
 
 LATENCY_MS = 1  # required latency timer of an FTDI adapter; the default is 16, and each reading waits for it
@@ -37,93 +38,147 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
     path = context.config.state_path(context.bench)
     if context.holder is not None:
         who = f"process {context.holder.pid} ({context.holder.command})" if context.holder.pid else "another process"
-        yield FindingCode.BENCH_IN_USE(holder=who, pid=context.holder.pid)
+        text = "in use by {holder}: servo, IMU and camera are not checked"
+        yield warning("bench_in_use", text, Do.STOP(), holder=who, pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
         what = state.fault.detail if state.fault else state.damage
-        yield FindingCode.STATE_DAMAGED(what=what, damage=state.damage)
+        fix = (
+            *("Check how far the cable is wound up, then", Do.ACKNOWLEDGE(), "If it hangs free,"),
+            *(Do.SET_REVOLUTIONS(revolutions=0), "Otherwise, give the revolutions that it is wound up."),
+        )
+        yield bad("state_damaged", "damaged state: {what}", fix, what=what, damage=state.damage)
     elif state.fault is not None:
-        yield FindingCode.FAULT_LATCHED(**plain(state.fault))
-    if context.holder is None and not state.damage and state.fault is None:
-        yield FindingCode.BENCH_FREE(bench=context.bench, state=path)
+        text = "fault {code} ({title}) is latched since {utc}: {detail}"
+        yield bad("fault_latched", text, Do.ACKNOWLEDGE(), **plain(state.fault))
+    elif context.holder is None:
+        yield fine("bench_free", "{bench}: free, no fault latched", bench=context.bench, state=path)
 
 
 def ports(context: DoctorContext) -> Iterator[Finding]:
     """Check the servo's serial port, the IMU's bus and the camera's device file: present, permitted, free, fast."""
-    head = context.config.imu.connection == "head"
-    for key, wanted in (("servo.port", context.config.servo.port), ("head.port", context.config.head.port))[: 1 + head]:
-        port = context.computer.serial_port(wanted)
+    config, computer = context.config, context.computer
+    head = config.imu.connection == "head"
+    for key, wanted in (("servo.port", config.servo.port), ("head.port", config.head.port))[: 1 + head]:
+        port = computer.serial_port(wanted)
         if port is None:
-            yield _missing(context, key, wanted, context.computer.serial_ports())
+            yield _no_serial_port(context, key, wanted)
             continue
-        findings = list(access(context, port, "dialout"))
-        yield from findings
-        if not any(one.fix for one in findings) and context.computer.is_left_to_modem_manager(port):
-            yield FindingCode.MODEM_MANAGER(udev_command(context), path=port.path)
+        found = access(context, port, "dialout")
+        yield found
+        if not found.steps and computer.is_left_to_modem_manager(port):
+            text = "ModemManager runs, and sends modem commands to {path} when it is plugged in"
+            yield warning("modem_manager", text, udev_command(context), path=port.path)
         if port.latency_ms is not None:
             yield _latency(context, port)
     if not head:
-        yield from _i2c(context)
-    yield from _video(context)
+        bus = computer.i2c_name(config.imu.bus)
+        buses = computer.i2c_buses(bus)
+        number = buses[0].path.removeprefix("/dev/i2c-") if buses else ""
+        enable = Do.SET_KEY(key="imu.bus", value=number) if buses else i2c_command(context)
+        yield _device_file(context, "no_i2c_bus", "I2C bus", bus, buses, "i2c", enable)
+    camera = camera_node(config.camera.source)
+    if camera is not None:  # else it is a file or a stream
+        nodes = computer.cameras()
+        connect: SomeSteps = ("Connect the camera, then", Do.FIND())
+        if nodes:
+            connect = Do.SET_KEY(key="camera.source", value=nodes[0].stable or nodes[0].path)
+        yield _device_file(context, "no_camera_device", "camera", camera, nodes, "video", connect)
 
 
-def _i2c(context: DoctorContext) -> Iterator[Finding]:
-    bus = context.computer.i2c_name(context.config.imu.bus)
-    buses = context.computer.i2c_buses(bus)
-    node = next((n for n in buses if context.computer.same_file(n.path, bus)), None)
-    if node is not None:
-        yield from access(context, node, "i2c")
-    elif buses:
-        fix = Do.SET_KEY(key="imu.bus", value=buses[0].path.removeprefix("/dev/i2c-"))
-        yield FindingCode.NO_I2C_BUS(fix, wanted=bus, found=_names(buses))
+def _device_file(
+    context: DoctorContext, code: str, kind: str, wanted: str, nodes: list[DeviceFile], group: str, fix: SomeSteps
+) -> Finding:
+    """Return whether the device file ``wanted`` is one of ``nodes`` and can be opened."""
+    node = next((node for node in nodes if context.computer.same_file(node.path, wanted)), None)
+    return _missing(code, kind, wanted, nodes, fix) if node is None else access(context, node, group)
+
+
+def _missing(code: str, kind: str, wanted: str, nodes: list[Any], fix: SomeSteps) -> Finding:
+    names = [f"{node.path} ({node.name})" for node in nodes]
+    return bad(code, f"there is no {kind} {{wanted}} (found: {{found}})", fix, wanted=wanted, found=names)
+
+
+def _no_serial_port(context: DoctorContext, key: str, wanted: str) -> Finding:
+    found = context.computer.serial_ports()
+    adapters = [port for port in found if port.usb]
+    if not adapters and (program := context.computer.running("brltty")) is not None:
+        text = "there is no serial port {wanted}, and brltty (process {pid}) takes USB adapters for itself"
+        return bad("brltty_takes_port", text, PORT_GRABBERS["brltty"], wanted=wanted, pid=program.pid)
+    fix: SomeSteps = Do.SETUP() if adapters else ("Plug the adapter in, then", Do.FIND())
+    if len(adapters) == 1:
+        fix = Do.SET_KEY(key=key, value=adapters[0].stable or adapters[0].path)
+    return _missing("no_serial_port", "serial port", wanted, found, fix)
+
+
+def access(context: DoctorContext, node: DeviceFile, usual_group: str) -> Finding:
+    """Return whether a device file can be opened: no other program uses it, and the user has permission."""
+    # A server that checks its own bench, and the guardian of its port, do not disturb it.
+    others = [one for one in node.holders if one.pid != os.getpid() and GUARDIAN not in one.command]
+    if others and not (context.holder and context.holder.pid in {process.pid for process in others}):
+        command, pid = others[0].command, others[0].pid
+        end = next((fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {pid}")
+        return bad("device_file_in_use", "{path} is in use by {holders}", end, path=node.path, holders=others)
+    if node.usable:
+        return fine("device_file", "{path}: {name}", path=node.path, name=node.name, stable=node.stable)
+    user, group = context.computer.user.name, node.group or usual_group
+    if group == "root":
+        code, why, fix = "root_only", ": only root has access", udev_command(context)
+    elif context.computer.joined(group):
+        code, why, fix = "group_at_next_login", " before the next login: group {group} is new", f"newgrp {group}"
     else:
-        yield FindingCode.NO_I2C_BUS(i2c_command(context), wanted=bus, found=[])
+        code, fix = "not_in_group", f"sudo usermod -aG {group} {user}"
+        why = ": the group {group} has; log in again after this"
+    text = f"{{user}} has no permission for {{path}} ({{name}}){why}"
+    return bad(code, text, fix, user=user, path=node.path, name=node.name, group=group)
 
 
-def _video(context: DoctorContext) -> Iterator[Finding]:
-    camera = camera_node(context.config.camera.source)
-    if camera is None:
-        return  # a file or a stream
-    cameras = context.computer.cameras()
-    node = next((n for n in cameras if context.computer.same_file(n.path, camera)), None)
-    if node is not None:
-        yield from access(context, node, "video")
-    else:
-        fix: SomeSteps = ("Connect the camera, then", Do.FIND())
-        if cameras:
-            fix = Do.SET_KEY(key="camera.source", value=cameras[0].stable or cameras[0].path)
-        yield FindingCode.NO_CAMERA_DEVICE(fix, wanted=camera, found=_names(cameras))
+def _latency(context: DoctorContext, port: SerialPort) -> Finding:
+    now = {"path": port.path, "latency_ms": port.latency_ms}
+    text = "latency timer of {path} is {latency_ms} ms"
+    if (port.latency_ms or 0) <= LATENCY_MS:
+        return fine("latency", text, **now)
+    fix, permanently = f"echo {LATENCY_MS} | sudo tee {port.latency_file}", context.step(Do.UDEV_RULES()).command
+    text += ": each reading waits for it (permanently: {permanently})"
+    return warning("high_latency", text, fix, permanently=permanently, **now)
 
 
 def disk(context: DoctorContext) -> Iterator[Finding]:
     """Check the free space for views, and that the disk is local."""
-    path = context.catalog_path
-    there = context.computer.disk(path)
+    path = context.config.catalog_path(context.bench)
+    there, user = context.computer.disk(path), context.computer.user.name
     views = there.free_bytes // VIEW_BYTES
     free = {"free_gb": there.free_bytes / 1e9, "path": path, "objects": views // context.config.enroll.views}
-    level = graded(bad=there.free_bytes < TOO_LITTLE_ROOM, warning=there.free_bytes < LITTLE_ROOM)
-    yield FindingCode.FREE_SPACE((), level, **free)
+    yield graded(
+        "free_space",
+        "{free_gb:.1f} GB free for {path}: about {objects} more objects",
+        Do.REMOVE_DELETED(),
+        is_bad=there.free_bytes < TOO_LITTLE_ROOM,
+        is_warning=there.free_bytes < LITTLE_ROOM,
+        **free,
+    )
     if not there.writable:
-        fix: SomeSteps = (
-            f"sudo chown -R {context.computer.user.name} {path}"
-            if path.exists()
-            else Do.SET_KEY(key="catalog.path", value="FOLDER")
-        )
-        yield FindingCode.NOT_WRITABLE(fix, user=context.computer.user.name, path=path)
+        fix: str | NextStep = Do.SET_KEY(key="catalog.path", value="FOLDER")
+        fix = f"sudo chown -R {user} {path}" if path.exists() else fix
+        yield bad("not_writable", "{user} may not write to {path}", fix, user=user, path=path)
     if there.network:
-        yield FindingCode.NETWORK_DISK(path=path)
+        fix = Do.SET_KEY(key="catalog.path", value="FOLDER-ON-A-LOCAL-DISK")
+        yield warning("network_disk", "{path} is on a network file system, where locks may fail", fix, path=path)
 
 
 def clock(context: DoctorContext) -> Iterator[Finding]:
     """Check that the civil time is right."""
     now, synchronised = context.computer.clock.utc(), context.computer.time_synchronised()
+    set_time, date = "sudo timedatectl set-ntp true", "{utc:%Y-%m-%d %H:%M} UTC"
     if now < _OLDEST_UTC or now > _OLDEST_UTC + timedelta(days=365 * 50):
-        yield FindingCode.WRONG_DATE(utc=now)
+        yield bad("wrong_date", f"the date is wrong: {date}: stored data would have a wrong date", set_time, utc=now)
     elif synchronised:
-        yield FindingCode.SYNCHRONIZED(utc=now)
+        yield fine("synchronized", f"{date}, synchronised by a time server", utc=now)
+    elif synchronised is None:
+        yield warning("no_time_server", f"{date}, no time server that is known here", set_time, utc=now)
     else:
-        code = FindingCode.NO_TIME_SERVER if synchronised is None else FindingCode.NOT_SYNCHRONIZED
-        yield code(utc=now)
+        text = f"{date}, but no time server has been reached since this computer started"
+        yield warning("not_synchronized", text, set_time, utc=now)
 
 
 def udev_rules(ports_found: list[SerialPort]) -> str:
@@ -169,52 +224,3 @@ def udev_command(context: DoctorContext) -> str:
 def i2c_command(context: DoctorContext) -> str:
     """Return the command that enables the computer's I2C buses."""
     return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in context.computer.model else "sudo modprobe i2c-dev"
-
-
-def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPort]) -> Finding:
-    fix: SomeSteps
-    match [port for port in found if port.usb]:
-        case [] if (program := context.computer.running("brltty")) is not None:
-            fix = PORT_GRABBERS["brltty"]
-            return FindingCode.BRLTTY_TAKES_PORT(fix, wanted=wanted, pid=program.pid)
-        case []:
-            fix = ("Plug the adapter in, then", Do.FIND())
-        case [one]:
-            fix = Do.SET_KEY(key=key, value=one.stable or one.path)
-        case _:
-            fix = Do.SETUP()
-    return FindingCode.NO_SERIAL_PORT(fix, wanted=wanted, found=_names(found))
-
-
-def access(context: DoctorContext, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
-    """Check that a device file can be opened: no other program uses it, and the user has permission."""
-    # A server that checks its own bench, and the guardian of its port, do not disturb it.
-    others = [one for one in node.holders if one.pid != os.getpid() and GUARDIAN not in one.command]
-    if others and not (context.holder and context.holder.pid in {process.pid for process in others}):
-        command = others[0].command
-        fix: SomeSteps = next((fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {others[0].pid}")
-        yield FindingCode.DEVICE_FILE_IN_USE(fix, path=node.path, holders=others)
-        return
-    if node.usable:
-        yield FindingCode.DEVICE_FILE(path=node.path, name=node.name, stable=node.stable)
-        return
-    user, group = context.computer.user.name, node.group or usual_group
-    if group == "root":
-        code, fix = FindingCode.ROOT_ONLY, udev_command(context)
-    elif context.computer.joined(group):
-        code, fix = FindingCode.GROUP_AT_NEXT_LOGIN, f"newgrp {group}"
-    else:
-        code, fix = FindingCode.NOT_IN_GROUP, f"sudo usermod -aG {group} {user}"
-    yield code(fix, user=user, path=node.path, name=node.name, group=group)
-
-
-def _latency(context: DoctorContext, port: SerialPort) -> Finding:
-    now = {"path": port.path, "latency_ms": port.latency_ms}
-    if port.latency_ms is None or port.latency_ms <= LATENCY_MS:
-        return FindingCode.LATENCY(**now)
-    fix, permanently = f"echo {LATENCY_MS} | sudo tee {port.latency_file}", context.step(Do.UDEV_RULES()).command
-    return FindingCode.HIGH_LATENCY(fix, permanently=permanently, **now)
-
-
-def _names(nodes: list[DeviceFile] | list[SerialPort]) -> list[str]:
-    return [f"{node.path} ({node.name})" for node in nodes]

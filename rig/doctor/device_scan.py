@@ -1,8 +1,8 @@
 """Find the devices that are connected to the computer, and their settings for the configuration."""
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -13,246 +13,202 @@ from rig.config import CameraConfig
 from rig.config.imus import imu_kind, recognised
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
+from rig.core.next_steps import Do
 from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
 from rig.devices.picamera2_capture import import_picamera2
 from rig.devices.v4l2 import VideoMode, choose_mode
-from rig.doctor.bus_scan import (
-    BAUD_RATES,
-    BaudScan,
-    FoundImu,
-    FoundServo,
-    scan_imus,
-    scan_rates,
-    unusable_address,
-    use_another_imu,
-)
 from rig.doctor.computer import access, i2c_command
-from rig.doctor.context import DoctorContext
-from rig.doctor.examination import Check
-from rig.doctor.finding import Finding, FindingCode, Severity, of_error
-from rig.doctor.servo import duplicate_id
+from rig.doctor.examination import Check, DoctorContext
+from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.imu import FoundImu, not_opened, rig_head, scan_imus, unusable
+from rig.doctor.servo import duplicate_id, foreign_bytes
+from rig.doctor.servo_scan import BAUD_RATES, scan_servos
+
+DeviceSettings = dict[Key, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class FoundCamera:
-    """A camera that opened, its default mode, and the modes that it offers."""
-
-    node: DeviceFile
-    width: int
-    height: int
-    fps: float
-    modes: tuple[VideoMode, ...] = ()
-
-
-@dataclass
 class DeviceScan:
-    """A scan of all ports, buses and cameras, and the devices found."""
+    """A scan of all ports, buses and cameras, in three checks.
 
-    ports: tuple[str, ...] | None = None
-    """Serial ports to scan; None: all on USB, and the configured one."""
-    servos: list[tuple[SerialPort, FoundServo]] = field(default_factory=list)
-    imus: list[FoundImu] = field(default_factory=list)
-    cameras: list[FoundCamera] = field(default_factory=list)
-    ribbons: list[int] = field(default_factory=list)
-    """Numbers of the cameras on ribbon cables."""
-    heads: list[tuple[SerialPort, str]] = field(default_factory=list)
-    """Ports of rig heads, with the `imu.model` of their sensors."""
-    duplicate_ids: bool = False
-    """Two servos with the same id were found."""
+    ``candidates`` are the settings of each device found that the rig can use, by what it may be.
+    """
 
-    @property
-    def settings(self) -> dict[Key, Any]:
-        """The settings of the unambiguous devices: those of which exactly one was found."""
-        wanted: dict[Key, Any] = {}
-        for what, found in self.candidates.items():
-            if len(found) == 1 and not (what == "servo" and self.duplicate_ids):
-                wanted |= found[0]
-        return wanted
-
-    @property
-    def candidates(self) -> dict[str, list[dict[Key, Any]]]:
-        """The settings of each device found that the rig can use, by what it may be."""
-        servos: list[dict[Key, Any]] = [
-            _keys("servo", port=port.stable or port.path, baud=found.baud, id=found.bus_id, model=found.model)
-            for port, found in self.servos
-        ]
-        imus: list[dict[Key, Any]] = [
-            _keys("imu", model=found.driver, bus=_number_or(found.bus, "/dev/i2c-"), address=found.address)
-            for found in self.imus
-        ]
-        heads: list[dict[Key, Any]] = [
-            _keys("imu", connection="head", model=model) | _keys("head", port=port.stable or port.path)
-            for port, model in self.heads
-        ]
-        cameras = [camera_settings(one) for one in self.cameras]
-        ribbons: list[dict[Key, Any]] = [_keys("camera", source=f"picamera2:{number}") for number in self.ribbons]
-        return {"servo": servos, "IMU": imus + heads, "camera": cameras + ribbons}
-
-    @property
-    def checks(self) -> tuple[Check, ...]:
-        return (
+    def __init__(self) -> None:
+        self.candidates: dict[str, list[DeviceSettings]] = {"servo": [], "IMU": [], "camera": []}
+        self._has_head = False
+        self._has_duplicate_ids = False
+        self.checks = (
             Check("servo", self.find_servos, deadline_s=90.0),
             Check("imu", self.find_imus),
             Check("camera", self.find_cameras, deadline_s=20.0),
         )
 
-    def find_servos(self, context: DoctorContext) -> Iterator[Finding | str]:
-        known = context.computer.serial_ports()
-        configured = context.computer.serial_port(context.config.servo.port)
-        if configured is not None and not any(context.computer.same_file(port.path, configured.path) for port in known):
-            known.append(configured)
-        if self.ports is not None:
-            known = [port for port in known if port.path in self.ports]
-        asked = [p for p in known if p.usb or context.computer.same_file(p.path, context.config.servo.port)]
+    @property
+    def settings(self) -> DeviceSettings:
+        """The settings of the unambiguous devices: those of which exactly one was found."""
+        wanted: DeviceSettings = {}
+        for what, found in self.candidates.items():
+            if len(found) == 1 and not (what == "servo" and self._has_duplicate_ids):
+                wanted |= found[0]
+        return wanted
+
+    def find_servos(self, context: DoctorContext) -> Iterator[Finding]:
+        """Scan the serial ports on USB, and the configured one, for servos and rig heads."""
+        computer, configured = context.computer, context.config.servo.port
+        known = computer.serial_ports()
+        port = computer.serial_port(configured)
+        if port is not None and not any(computer.same_file(other.path, port.path) for other in known):
+            known.append(port)
+        asked = [port for port in known if port.usb or computer.same_file(port.path, configured)]
         if not asked:
-            yield FindingCode.NO_USB_PORT(found=[port.path for port in known])
+            fix = ("Connect the U2D2, then", Do.FIND())
+            yield bad("no_usb_port", "no serial port on USB (found: {found})", fix, found=[port.path for port in known])
         for port in asked:
             yield from self._on_port(context, port)
 
-    def _on_port(self, context: DoctorContext, port: SerialPort) -> Iterator[Finding | str]:
-        """Scan a port for servos, then for a rig head."""
-        if problems := [finding for finding in access(context, port, "dialout") if finding.fix]:
-            yield from problems
+    def _on_port(self, context: DoctorContext, port: SerialPort) -> Iterator[Finding]:
+        if (problem := access(context, port, "dialout")).steps:
+            yield problem
             return
-        known_head = context.config.imu.connection == "head" and context.computer.same_file(
-            port.path, context.config.head.port
-        )
+        # A head is not asked for servos, whose bytes it does not know.
+        head = context.config.imu.connection == "head" and context.config.head.port
+        is_head = bool(head) and context.computer.same_file(port.path, str(head))
         try:
-            servos = False if known_head else (yield from self._servos(context, port))
-            head = False if servos else (yield from self._head(context, port))
+            found = [] if is_head else self._servos(context, port)
+            found = found or self._head(context, port)
         except DeviceNotFound as error:
             yield of_error(error)
         except (serial.SerialException, OSError) as error:
-            yield FindingCode.PORT_FAILED(port=port.path, reason=str(error))
+            fix = ("Connect the adapter again, then", Do.FIND())
+            yield bad("port_failed", "{port} failed: {reason}", fix, port=port.path, reason=str(error))
         else:
-            if not (servos or head or self.duplicate_ids):
-                yield FindingCode.NOTHING_ON_PORT(port=port.path, name=port.name)
+            yield from found
+            if not found:
+                text = "{port} ({name}): no servo and no rig head answer at any baud rate"
+                fix = ("Check the servo's cable and switch on its supply, then", Do.FIND())
+                yield warning("nothing_on_port", text, fix, port=port.path, name=port.name)
 
-    def _servos(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
+    def _servos(self, context: DoctorContext, port: SerialPort) -> list[Finding]:
         with closing(context.computer.open_serial(port.path, BAUD_RATES[0])) as wire:
-            answered = yield from scan_rates(context, wire, BAUD_RATES, port.path)
-        for scan in answered:
-            yield from self._found(port, scan)
-        return any(scan.answered for scan in answered)
-
-    def _head(
-        self, context: DoctorContext, port: SerialPort, model: str | None = None
-    ) -> Generator[Finding | str, None, bool]:
-        yield f"{port.path}: searching for a rig head ..."
-        imu = context.config.imu.model_copy(update={"model": model or context.config.imu.model})
-        head_config = context.config.head.model_copy(update={"port": port.path})
-        config = context.config.model_copy(update={"head": head_config, "imu": imu})
-        try:
-            with closing(
-                open_head(config, lambda: context.computer.open_serial(port.path, BAUD), context.computer.clock)
-            ) as head:
-                who = head.identity
-        except DeviceNotFound:
-            return False
-        except RigError as error:  # a rig head with an error
-            other = recognised(imu.address, imu_kind(imu.model).register, error.evidence.get("got", -1))
-            if model is None and other is not None and other.driver:
-                return (yield from self._head(context, port, other.key))
-            yield replace(of_error(error), topic="imu")
-            return True
-        self.heads.append((port, imu.model))
-        parts = {"model": who.model, "board": who.board, "firmware": who.firmware}
-        yield replace(FindingCode.HEAD(port=port.path, **parts), topic="imu")
-        return True
-
-    def _found(self, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
-        for found in scan.servos:
+            scans = scan_servos(wire, context.computer.clock, preferred=context.config.servo.baud)
+        findings = []
+        for found in (servo for scan in scans for servo in scan.servos):
             place = {"port": port.path, "id": found.bus_id, "baud": found.baud}
             if found.obstacle:
                 reason, fix = found.obstacle
-                yield FindingCode.SERVO_NOT_DRIVEN(fix, found=found, reason=reason, **place)
+                text = "{port}: {found}: the rig cannot drive it: {reason}"
+                findings.append(warning("servo_not_driven", text, fix, found=found, reason=reason, **place))
                 continue
-            self.servos.append((port, found))
-            yield FindingCode.SERVO_FOUND(found=found, **place)
-        if scan.duplicate_ids:
-            self.duplicate_ids = True
-            yield duplicate_id(port.path, scan)
-        if scan.noise:
-            yield FindingCode.FOREIGN_BYTES(port=port.path, baud=scan.baud)
+            own = _keys("servo", port=port.stable or port.path, baud=found.baud, id=found.bus_id, model=found.model)
+            self.candidates["servo"].append(own)
+            findings.append(fine("servo_found", "{port}: {found}", found=found, **place))
+        self._has_duplicate_ids |= any(scan.duplicate_ids for scan in scans)
+        findings += [duplicate_id(port.path, scan) for scan in scans if scan.duplicate_ids]
+        return findings + [foreign_bytes(port.path, scan) for scan in scans if scan.noise]
 
-    def find_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
-        asked = 0
-        before = len(self.imus)
-        for node in context.computer.i2c_buses(context.config.imu.bus):
-            asked += 1
-            if problems := [finding for finding in access(context, node, "i2c") if finding.fix]:
-                yield from problems
+    def _head(self, context: DoctorContext, port: SerialPort, model: str | None = None) -> list[Finding]:
+        """Return what a rig head at a port says; nothing if there is none.
+
+        A head reports an error if its sensor is another than ``model`` or the configured one: then that is tried.
+        """
+        imu = context.config.imu.model_copy(update={"model": model or context.config.imu.model})
+        place = context.config.head.model_copy(update={"port": port.path})
+        config, computer = context.config.model_copy(update={"head": place, "imu": imu}), context.computer
+        try:
+            with closing(open_head(config, lambda: computer.open_serial(port.path, BAUD), computer.clock)) as head:
+                found = rig_head(head, port.path)
+        except DeviceNotFound:
+            return []
+        except RigError as error:
+            other = recognised(imu.address, imu_kind(imu.model).register, error.evidence.get("got", -1))
+            if model is None and other is not None and other.driver:
+                return self._head(context, port, other.key)
+            found = of_error(error)
+        else:
+            own = _keys("imu", connection="head", model=imu.model)
+            self.candidates["IMU"].append(own | _keys("head", port=port.stable or port.path))
+            self._has_head = True
+        return [replace(found, topic="imu")]
+
+    def find_imus(self, context: DoctorContext) -> Iterator[Finding]:
+        """Scan the I2C buses for IMUs."""
+        nodes = context.computer.i2c_buses(context.config.imu.bus)
+        before = len(self.candidates["IMU"])
+        for node in nodes:
+            if (problem := access(context, node, "i2c")).steps:
+                yield problem
                 continue
-            yield f"{node.path}: searching for IMUs ..."
             try:
                 there = scan_imus(context.computer, node.path)
             except OSError as error:
-                yield FindingCode.I2C_NOT_OPENED(bus=node.path, reason=error.strerror)
+                yield not_opened(node.path, error)
                 continue
-            failures = {found.errno for found in there if found.errno}
+            reported = set()
             for found in there:
-                if (problem := unusable_address(found)) is not None:
-                    if not found.errno or found.errno in failures:  # a failing bus is reported once
-                        yield problem
-                    failures.discard(found.errno)
-                elif found.driver:
-                    self.imus.append(found)
-                    yield FindingCode.IMU_FOUND(found=found, bus=found.bus, address=found.address)
-                else:
-                    level = Severity.WARNING
-                    yield FindingCode.NO_DRIVER(use_another_imu(), level, found=found, address=found.address)
-        if not asked and not self.heads:
-            yield FindingCode.NO_I2C(i2c_command(context))
-        elif len(self.imus) == before and not self.heads:
-            yield FindingCode.NO_IMU_FOUND()
+                if (reason := unusable(context.computer, found)) is None:
+                    self.candidates["IMU"].append(imu_settings(found))
+                    yield fine("imu_found", "{found}", found=found, bus=found.bus, address=found.address)
+                elif reason.code not in reported:
+                    yield reason
+                # A bus that fails does so at each address, and is reported once.
+                reported |= {reason.code} if reason and reason.code.startswith("i2c") else set()
+        if not nodes and not self._has_head:
+            yield bad("no_i2c", "no I2C bus", i2c_command(context))
+        elif len(self.candidates["IMU"]) == before and not self._has_head:
+            fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
+            yield warning("no_imu_found", "no IMU answers on any I2C bus", fix)
 
-    def find_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
-        nodes = context.computer.cameras()
-        ribbons = context.computer.ribbon_cameras()
+    def find_cameras(self, context: DoctorContext) -> Iterator[Finding]:
+        """Find the cameras on USB and on ribbon cables."""
+        nodes, ribbons = context.computer.cameras(), context.computer.ribbon_cameras()
         for number, name in enumerate(ribbons):
-            self.ribbons.append(number)
+            self.candidates["camera"].append(_keys("camera", source=f"picamera2:{number}"))
             yield ribbon_camera(name, number)
         if not nodes and not ribbons:
-            yield FindingCode.NO_CAMERA()
+            yield warning("no_camera", "no camera", ("Connect the camera, then", Do.FIND()))
         for node in nodes:
-            if problems := [finding for finding in access(context, node, "video") if finding.fix]:
-                yield from problems
+            if (problem := access(context, node, "video")).steps:
+                yield problem
                 continue
-            yield f"{node.path}: opening ..."
             try:
                 capture = context.computer.open_capture(node.path)
             except DeviceNotFound as error:
                 yield of_error(error)
                 continue
             width, height = (round(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-            found = FoundCamera(node, width, height, capture.get(cv2.CAP_PROP_FPS), modes_of(capture))
+            fps, modes = capture.get(cv2.CAP_PROP_FPS), modes_of(capture)
             capture.release()
-            self.cameras.append(found)
-            mode = {"path": node.path, "width": width, "height": height, "fps": found.fps}
-            yield FindingCode.CAMERA(name=f"{node.path}: {node.name}", **mode)
+            self.candidates["camera"].append(camera_settings(node, modes))
+            text = "{path}: {name}: {width}x{height} at {fps:.3g} frames/s"
+            yield fine("camera", text, path=node.path, name=node.name, width=width, height=height, fps=fps)
 
 
 def ribbon_camera(name: str, number: int) -> Finding:
     """Return how a camera on the ribbon cable of a Raspberry Pi is reached."""
-    place = {"name": name, "number": number}
+    text, place = "{name} on the ribbon cable", {"name": name, "number": number}
     try:
         import_picamera2()
     except DeviceNotFound as error:
-        parameters = place | {"what": error.what.rstrip("."), **error.evidence}
-        return FindingCode.RIBBON_CAMERA_UNREACHABLE(error.steps, **parameters)
-    return FindingCode.RIBBON_CAMERA(**place)
+        why = place | {"what": error.what.rstrip("."), **error.evidence}
+        return warning("ribbon_camera_unreachable", text + ": {what}: {reason}", error.steps, **why)
+    return fine("ribbon_camera", text + ": camera.source is picamera2:{number}", **place)
 
 
-def camera_settings(found: FoundCamera) -> dict[Key, Any]:
+def imu_settings(found: FoundImu) -> DeviceSettings:
+    """Return the settings of this IMU, by key."""
+    return _keys("imu", model=found.driver, bus=_number_or(found.bus, "/dev/i2c-"), address=found.address)
+
+
+def camera_settings(node: DeviceFile, modes: Sequence[VideoMode] = ()) -> DeviceSettings:
     """Return the settings of this camera, by key; its number may change after a restart.
 
     The mode is the offered one that is nearest to the default.
     """
-    settings: dict[str, Any] = {"source": found.node.stable or _number_or(found.node.path, "/dev/video")}
+    settings: dict[str, Any] = {"source": node.stable or _number_or(node.path, "/dev/video")}
     usual = CameraConfig()
-    mode = choose_mode(found.modes, usual.width, usual.height, usual.fps)
+    mode = choose_mode(modes, usual.width, usual.height, usual.fps)
     if mode is not None and (mode.width, mode.height) != (usual.width, usual.height):
         settings |= {"width": mode.width, "height": mode.height}
     if mode is not None and 0 < mode.fps < 0.9 * usual.fps:
@@ -260,7 +216,7 @@ def camera_settings(found: FoundCamera) -> dict[Key, Any]:
     return _keys("camera", **settings)
 
 
-def _keys(section: str, **values: Any) -> dict[Key, Any]:
+def _keys(section: str, **values: Any) -> DeviceSettings:
     return {(section, name): value for name, value in values.items()}
 
 

@@ -1,22 +1,25 @@
-"""Check the IMU: its identity, and its readings at rest."""
+"""Find IMUs on I2C buses, and check the configured one: its identity, and its readings at rest."""
 
+import os
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
+from errno import EBUSY, EIO
 from typing import Any
 
 import numpy as np
+from smbus2 import SMBus
 
-from rig.config import ImuConfig
-from rig.config.imus import imu_kind
+from rig.bench.computer import Computer
+from rig.config.imus import imu_kind, imu_kinds
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.bno055 import SLOW_BUS
-from rig.devices.head.head import open_head
+from rig.devices.head.head import RigHead, open_head
 from rig.devices.head.protocol import BAUD
+from rig.devices.i2c import NO_DEVICE, RESTART_CONTROLLER, STUCK, controller_hangs, unbind_command
 from rig.devices.imu import Imu, ImuSamples, open_imu
-from rig.doctor.bus_scan import FoundImu, scan_imus, unusable_address, use_another_imu
-from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, of_error
+from rig.doctor.examination import DoctorContext
+from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.safety.gyro_rotation import DRAIN_SAMPLES
 
 SECONDS, DRAIN_S = 1.5, 0.25
@@ -28,55 +31,153 @@ STRETCH_KHZ = 20.0
 UPRIGHT = 0.94  # share of gravity along the table's axis when the sensor lies within 20° of it
 
 
+@dataclass(frozen=True, slots=True)
+class FoundImu:
+    """A device at an IMU address; ``driver``, the ``imu.model``, is None if there is no driver, or if it is unknown.
+
+    ``note`` has more about it: the note of its row, or registers of an unknown chip. ``errno`` is the error of the bus
+    at the address; the controller ``hangs`` if this is the only answer of the whole bus.
+    """
+
+    bus: str
+    address: int
+    name: str
+    driver: str | None = None
+    note: str = ""
+    errno: int = 0
+    hangs: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.note}" if self.note else "")
+
+
+def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
+    """Return the devices that answer at IMU addresses; no other address is asked, and nothing is written.
+
+    An address at which the bus fails is also returned, with the error's number: the others are asked nevertheless.
+
+    Raises `OSError`: the bus cannot be opened.
+    """
+    name, path, kinds = computer.i2c_name(bus), computer.i2c_path(bus), imu_kinds().values()
+    found, failures = [], []
+    with SMBus(path) as wire:
+        for address in sorted({address for kind in kinds for address in kind.addresses}):
+            here = [kind for kind in kinds if address in kind.addresses]
+            try:
+                said = {
+                    register: wire.read_byte_data(address, register)
+                    for register in sorted({kind.register for kind in here})
+                }
+            except OSError as error:
+                failures.append(error.errno or EIO)
+                if failures[-1] not in NO_DEVICE:
+                    found.append(FoundImu(name, address, "unknown device", errno=failures[-1]))
+                continue
+            kind = next((kind for kind in here if said[kind.register] in kind.identities), None)
+            values = ", ".join(f"register {register:#04x} is {value:#04x}" for register, value in said.items())
+            if kind is None:
+                found.append(FoundImu(name, address, "unknown chip", note=values))
+            else:
+                found.append(FoundImu(name, address, kind.name, kind.key if kind.driver else None, kind.note))
+    hangs = all(one.errno for one in found) and controller_hangs(path, failures)
+    return [replace(one, hangs=hangs) for one in found]
+
+
+def unusable(computer: Computer, found: FoundImu) -> Finding | None:
+    """Return why the rig cannot use a device: a kernel driver uses it, the bus fails, or the rig has no driver."""
+    place = {"bus": found.bus, "address": found.address}
+    if found.errno == EBUSY:
+        text = "the kernel driver {driver} uses {address:#04x} of {bus}"
+        driver = computer.i2c_driver(found.bus, found.address)
+        fix = unbind_command(found.bus.removeprefix("/dev/"), found.address, driver or "")
+        fix = fix if driver else "ls -l /sys/bus/i2c/devices/*/driver"
+        return bad("kernel_driver", text, fix, driver=driver or "(unknown)", **place)
+    if found.errno:
+        place |= {"reason": os.strerror(found.errno), "errno": found.errno}
+        restart = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
+        if found.hangs:
+            text = "the controller of {bus} hangs: {reason}; it works again after its supply was off"
+            return bad("i2c_hangs", text, RESTART_CONTROLLER, **place)
+        if found.errno in STUCK:
+            return bad("i2c_stuck", "{bus} is stuck: {reason}; a device blocks the bus", restart, **place)
+        return bad("i2c_failed", "{bus} fails at {address:#04x}: {reason}", restart, **place)
+    if found.driver is None:
+        fix = f"Use one of these sensors: {', '.join(kind.name for kind in imu_kinds().values() if kind.driver)}"
+        return bad("no_driver", "{found}: the rig has no driver for it", fix, found=found, address=found.address)
+    return None
+
+
+def not_opened(bus: str, error: OSError) -> Finding:
+    """Return the finding that an I2C bus cannot be opened."""
+    return bad("i2c_not_opened", "{bus} cannot be opened: {reason}", Do.FIND(), bus=bus, reason=error.strerror)
+
+
+def rig_head(head: RigHead, port: str) -> Finding:
+    """Return which rig head is at a port, and its sensor."""
+    who = head.identity
+    parts = {"model": who.model, "board": who.board, "firmware": who.firmware, "serial": who.serial}
+    return fine("head", "{model} on a rig head ({board}, firmware {firmware}) at {port}", port=port, **parts)
+
+
 def imu(context: DoctorContext) -> Iterator[Finding]:
     """Identify the sensor, then check its noise, its zero, and its orientation."""
-    config, clock = context.config, context.computer.clock
+    config, computer = context.config, context.computer
     # The sensor of a rig head is not on a bus of this computer.
     if config.imu.connection == "head":
-        head = open_head(config, lambda: context.computer.open_serial(config.head.port, BAUD), clock)
-        with closing(head):
-            who = head.identity
-            parts = {"model": who.model, "board": who.board, "firmware": who.firmware, "serial": who.serial}
-            yield FindingCode.HEAD(port=config.head.port, **parts)
+        with closing(open_head(config, lambda: computer.open_serial(config.head.port, BAUD), computer.clock)) as head:
+            yield rig_head(head, config.head.port)
             if (fault := head.fault) is not None:
                 yield of_error(fault, Do.ACKNOWLEDGE())
             yield from _at_rest(context, head)
         return
     # A Raspberry Pi's controller corrupts bytes of a sensor that stretches the clock: warn before the cause is in
     # doubt.
-    khz = context.computer.cannot_stretch_khz(config.imu.bus)
+    bus, khz = computer.i2c_name(config.imu.bus), computer.cannot_stretch_khz(config.imu.bus)
     if config.imu.model == "bno055" and khz is not None and khz > STRETCH_KHZ:
-        bus = context.computer.i2c_name(config.imu.bus)
-        yield FindingCode.CLOCK_STRETCHING(bus=bus, khz=khz)
+        text = "{bus} runs at {khz:g} kHz and does not wait for a BNO055, which stretches the clock"
+        slower = "echo dtparam=i2c_arm_baudrate=10000 | sudo tee -a /boot/firmware/config.txt && sudo reboot"
+        yield warning("clock_stretching", text, slower, bus=bus, khz=khz)
     try:
-        there = scan_imus(context.computer, config.imu.bus)
+        there = scan_imus(computer, config.imu.bus)
     except OSError as error:
-        bus = context.computer.i2c_name(config.imu.bus)
-        yield FindingCode.I2C_NOT_OPENED(bus=bus, reason=error.strerror)
+        yield not_opened(bus, error)
         return
     here = next((found for found in there if found.address == config.imu.address), None)
     if here is None or here.driver != config.imu.model:
-        yield _wrong(context, config.imu, here, there)
+        yield _wrong(context, here, [found for found in there if found.driver])
         return
-    with closing(open_imu(config.imu, context.computer.i2c_path(config.imu.bus), clock)) as sensor:
-        bus, identity = context.computer.i2c_name(config.imu.bus), sensor.identity
+    with closing(open_imu(config.imu, computer.i2c_path(config.imu.bus), computer.clock)) as sensor:
+        identity = sensor.identity
         parts = {"model": identity.model, "address": identity.bus_address, "who_am_i": identity.who_am_i}
-        yield FindingCode.IMU(bus=bus, **parts)
+        yield fine("imu", "{model} at {address:#04x} of {bus} (identity {who_am_i:#04x})", bus=bus, **parts)
         # The sensor works: now its samples and its bus.
         yield from _at_rest(context, sensor)
-        corrupt = getattr(getattr(sensor, "statistics", None), "corrupt", 0)
-        if corrupt:
+        if corrupt := getattr(getattr(sensor, "statistics", None), "corrupt", 0):
             fix = SLOW_BUS if config.imu.model == "bno055" else ("Shorten the I2C cable, then", Do.DOCTOR())
-            yield FindingCode.CORRUPT_READINGS(fix, corrupt=corrupt)
+            yield warning("corrupt_readings", "{corrupt} readings of the sensor were corrupt", fix, corrupt=corrupt)
+
+
+def _wrong(context: DoctorContext, here: FoundImu | None, usable: list[FoundImu]) -> Finding:
+    """Return why the configured sensor is not there: what is at its address, or at which address another is."""
+    config = context.config.imu
+    if here is not None:
+        fix: SomeSteps = Do.SET_KEY(key="imu.model", value=here.driver)
+        other = {"found": here, "address": here.address, "model": config.model}
+        return unusable(context.computer, here) or bad("other_imu", "{found}, but imu.model is {model}", fix, **other)
+    fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
+    if usable:
+        fix = Do.SET_KEY(key="imu.address", value=f"{usable[0].address:#04x}")
+    text = "no device answers at {address:#04x} of {bus} (at other IMU addresses: {found})"
+    bus = context.computer.i2c_name(config.bus)
+    return bad("no_imu", text, fix, address=config.address, bus=bus, found=usable)
 
 
 def _at_rest(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
-    identity = sensor.identity
     if note := imu_kind(context.config.imu.model).note:
-        yield FindingCode.IMU_NOTE(note=note)
-    context.identities["imu"] = asdict(identity)
-    yield from _rest(context, sensor, _samples(context, sensor))
-    yield from _gravity(context, sensor)
+        yield fine("imu_note", "{note}", note=note)
+    context.identities["imu"] = asdict(sensor.identity)
+    yield _rest(context, sensor, _samples(context, sensor))
+    yield _gravity(context, sensor)
 
 
 def _samples(context: DoctorContext, sensor: Imu) -> ImuSamples:
@@ -94,59 +195,49 @@ def _samples(context: DoctorContext, sensor: Imu) -> ImuSamples:
     )
 
 
-def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Iterator[Finding]:
-    axis = "xyz".index(context.config.imu.axis)
+def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Finding:
     wanted = SECONDS * sensor.rate_hz
     if len(samples.time_ns) < 0.8 * wanted:
+        text = "{samples} samples in {seconds:g} s instead of {wanted:.0f}, {lost} lost"
         counts = {"samples": len(samples.time_ns), "seconds": SECONDS, "wanted": wanted, "lost": samples.lost}
-        yield FindingCode.SAMPLES_MISSING(**counts)
-        return
-    rates = samples.gyro_dps
-    spread = rates.std(axis=0)
-    bias = float(rates[:, axis].mean())
+        fix = "Shorten the I2C cable and remove other devices from the bus, then"
+        return bad("samples_missing", text, (fix, Do.DOCTOR()), **counts)
+    axis, rates = "xyz".index(context.config.imu.axis), samples.gyro_dps
+    spread, bias = rates.std(axis=0), float(rates[:, axis].mean())
     expected = sensor.identity.gyro_noise_dps_rthz * np.sqrt(sensor.rate_hz / 2)
     evidence: dict[str, Any] = {"noise_dps": float(spread[axis]), "bias_dps": bias, "samples": len(rates)}
+    noise, zero = "noise {noise_dps:.3f} °/s", "zero at {bias_dps:+.2f} °/s"
     if (np.abs(rates) >= sensor.range_dps * 0.999).any():
-        yield FindingCode.SATURATED(range_dps=sensor.range_dps, **evidence)
-    elif (rates == rates[0]).all():
-        yield FindingCode.IMU_FROZEN(**evidence)
-    elif spread.max() > NO_REST_DPS:
-        yield FindingCode.NOT_AT_REST(**evidence)
-    elif spread.max() > NOISY * expected:
-        yield FindingCode.NOISY(expected_dps=expected, **evidence)
-    elif abs(bias) > MAX_BIAS_DPS:
-        yield FindingCode.LARGE_BIAS(**evidence)
-    else:
-        yield FindingCode.AT_REST(**evidence)
+        fix = "Check the sensor's supply and cable, then"
+        text = "saturated at {range_dps:.0f} °/s at rest"
+        return bad("saturated", text, (fix, Do.DOCTOR()), range_dps=sensor.range_dps, **evidence)
+    if (rates == rates[0]).all():
+        fix = "Switch the sensor's supply off and on, then"
+        return bad("imu_frozen", "frozen: all samples are identical, without noise", (fix, Do.DOCTOR()), **evidence)
+    if spread.max() > NO_REST_DPS:
+        fix = "Check the sensor's supply, ground and cable, then"
+        return bad("not_at_rest", f"{noise}, {zero}: more than a table at rest shows", (fix, Do.DOCTOR()), **evidence)
+    if spread.max() > NOISY * expected:
+        fix = "Keep hands and vibration away from the bench, then"
+        text = f"{noise} at rest; {{expected_dps:.3f}} °/s is usual"
+        return warning("noisy", text, (fix, Do.DOCTOR()), expected_dps=expected, **evidence)
+    if abs(bias) > MAX_BIAS_DPS:
+        return bad("large_bias", f"{zero}: outside the datasheet", "Replace the sensor", **evidence)
+    return fine("at_rest", f"at rest: {noise}, {zero}", **evidence)
 
 
-def _gravity(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
+def _gravity(context: DoctorContext, sensor: Imu) -> Finding:
     gravity = sensor.read_gravity_g()
-    size = float(np.linalg.norm(gravity))
-    axis = context.config.imu.axis
+    size, axis = float(np.linalg.norm(gravity)), context.config.imu.axis
     along = float(gravity["xyz".index(axis)])
     evidence: dict[str, Any] = {"gravity_g": [round(float(g), 4) for g in gravity], "size_g": size, "axis": axis}
     if not 0.8 < size < 1.2:
-        yield FindingCode.WRONG_GRAVITY(**evidence)
-    elif abs(along) < UPRIGHT * size:
+        fix: SomeSteps = ("Check the sensor's supply, then", Do.DOCTOR())
+        return bad("wrong_gravity", "gravity is {size_g:.2f} g", fix, **evidence)
+    if abs(along) < UPRIGHT * size:
         upright = "xyz"[int(np.abs(gravity).argmax())]
         fix = Do.SET_KEY(key="imu.axis", value=upright) if upright != axis else "Mount the sensor flat on the platter"
-        yield FindingCode.TILTED(fix, along=along / size, **evidence)
-    else:
-        yield FindingCode.GRAVITY(along=abs(along / size), **evidence)
-
-
-def _wrong(context: DoctorContext, config: ImuConfig, here: FoundImu | None, there: list[FoundImu]) -> Finding:
-    bus = context.computer.i2c_name(config.bus)
-    if here is not None and (problem := unusable_address(here)) is not None:
-        return problem
-    if here is not None and here.driver is None:
-        return FindingCode.NO_DRIVER(use_another_imu(), found=here, address=here.address)
-    if here is not None:
-        fix: SomeSteps = Do.SET_KEY(key="imu.model", value=here.driver)
-        return FindingCode.OTHER_IMU(fix, found=here, address=here.address, model=config.model)
-    usable = [found for found in there if found.driver]
-    fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
-    if usable:
-        fix = Do.SET_KEY(key="imu.address", value=f"{usable[0].address:#04x}")
-    return FindingCode.NO_IMU(fix, address=config.address, bus=bus, found=usable)
+        text = "its {axis} axis does not point along the table's axis: {along:+.2f} of gravity is along it"
+        return warning("tilted", text, fix, along=along / size, **evidence)
+    text = "gravity {size_g:.2f} g, {along:.0%} of it along {axis}"
+    return fine("gravity", text, along=abs(along / size), **evidence)

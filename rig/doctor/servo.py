@@ -1,7 +1,7 @@
 """Check the servo: its identity, settings and state; reads only."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import asdict
 from typing import Any
 
@@ -11,17 +11,12 @@ from rig.core.clock import seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.dynamixel.registers import (
-    control_table,
-    model_of,
-    obstacle,
-    servo_plugin,
-)
+from rig.devices.dynamixel.registers import control_table, model_of, obstacle, servo_plugin
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
-from rig.doctor.bus_scan import BAUD_RATES, BaudScan, FoundServo, scan_rates, scan_servos
-from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, Severity, graded, of_error
+from rig.doctor.examination import DoctorContext
+from rig.doctor.finding import Finding, bad, fine, graded, of_error, warning
+from rig.doctor.servo_scan import BAUD_RATES, BaudScan, FoundServo, scan_servos
 
 READS = 100  # finds one bad reading in fifty; takes half a second at 57,600 bit/s
 REPEATED = 2  # number of repeated readings on a good bus
@@ -29,61 +24,60 @@ SLOW = 1 / 3  # share of the control loop's period that a reading may take; the 
 IMPOSSIBLE_C = 150
 
 
-def servo(context: DoctorContext) -> Iterator[Finding | str]:
+def servo(context: DoctorContext) -> Iterator[Finding]:
     """Find the configured servo and others on its bus, and check its settings, supply and temperature."""
     config = context.config.servo
     if context.config.imu.connection == "head" and context.config.head.power:
-        yield FindingCode.SUPPLY_SWITCHED()
+        text = "not checked: the rig head's relay switches its supply on only while a program runs"
+        yield warning("supply_switched", text, Do.STATUS())
         return
-    with ExitStack() as opened:
-        try:
-            wire = context.computer.open_serial(config.port, config.baud)
-        except DeviceNotFound as error:
-            yield of_error(error)
-            return
-        opened.callback(wire.close)
+    with closing(context.computer.open_serial(config.port, config.baud)) as wire:
         plugged = servo_plugin(config.model)
         foreign = plugged is not None and not isinstance(plugged, DynamixelModel)  # it must hear no Dynamixel packets
         try:
             found = open_servo(wire, config, context.computer.clock, context.config.table.mode)
-        except DeviceNotFound as error:
-            yield from [of_error(error)] if foreign else _scan_rates(context, wire)
+        except DeviceNotFound:
+            if foreign:
+                raise
+            yield _elsewhere(context, wire)
             return
         except DeviceMismatch as error:
             number = error.evidence.get("model_number")  # another maker's driver may not report it
             model = None if number is None or obstacle(number) else model_of(number)
             yield of_error(error, Do.SET_KEY(key="servo.model", value=model) if model else "")
             return
-        except DeviceSilent as error:
-            yield from () if foreign else _others_on_bus(context, wire)
-            yield of_error(error)
-            return
+        except DeviceSilent:
+            if not foreign:
+                yield _others_on_bus(context, wire)
+            raise
+        # It answers: what it is, what else is on its bus, how it is set, how it is, and how reliably it answers.
         identity = found.identity
         context.identities["servo"] = asdict(identity)
         name = identity.model.replace("_", "-").upper()
-        yield FindingCode.SERVO(model=name, firmware=identity.firmware, **_place(config))
+        text = "{model}, firmware {firmware}, id {id} at {baud} baud, {port}"
+        yield fine("servo", text, model=name, firmware=identity.firmware, **_place(config))
         if isinstance(found, DynamixelServo):
-            yield from _others_on_bus(context, wire)
+            yield _others_on_bus(context, wire)
             yield from _settings(found)
         yield from _condition(context, found)
         if isinstance(found, DynamixelServo):
-            yield from _bus_quality(context, found)
+            yield _bus_quality(context, found)
 
 
-def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding | str]:
-    """Scan the other baud rates, because the configured servo does not answer."""
+def _elsewhere(context: DoctorContext, wire: SerialConnection) -> Finding:
+    """Return what answers at other ids and baud rates, because the configured servo does not answer."""
     config = context.config.servo
     rates = (config.baud, *(rate for rate in BAUD_RATES if rate != config.baud))
-    answered = yield from scan_rates(context, wire, rates, config.port)
-    if answered and answered[-1].duplicate_ids:
-        yield duplicate_id(config.port, answered[-1])
-        return
-    there = [found for scan in answered for found in scan.servos]
+    scans = scan_servos(wire, context.computer.clock, rates, config.baud)
+    if scans and scans[-1].duplicate_ids:
+        return duplicate_id(config.port, scans[-1])
+    there = [found for scan in scans for found in scan.servos]
+    text = "no servo answers at id {id}, {baud} baud, {port}"
     if not there:
-        yield FindingCode.NO_SERVO(**_place(config))
-        return
-    fix = Do.SETUP() if len(there) > 1 else _use(config, there[0])
-    yield FindingCode.OTHER_SERVOS(fix, found=there, **_place(config))
+        fix = ("Check the servo's cable and switch on its 12 V supply (its LED blinks once), then", Do.DOCTOR())
+        return bad("no_servo", f"{text}, nor any other at any baud rate", fix, **_place(config))
+    use = Do.SETUP() if len(there) > 1 else _use(config, there[0])
+    return bad("other_servos", f"{text} (found: {{found}})", use, found=there, **_place(config))
 
 
 def _place(config: ServoConfig) -> dict[str, Any]:
@@ -103,19 +97,18 @@ def _use(config: ServoConfig, there: FoundServo) -> SomeSteps:
     return changes[0] if len(changes) == 1 else Do.SETUP()
 
 
-def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding]:
-    """Find other servos at this baud rate, and servos with the same id."""
+def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Finding:
+    """Return what else answers at this baud rate: other servos, or a servo with the same id."""
     config = context.config.servo
-    for scan in scan_servos(wire, context.computer.clock, [config.baud]):
-        others = [servo for servo in scan.servos if servo.bus_id != config.id]
-        if scan.duplicate_ids:
-            yield duplicate_id(config.port, scan)
-        elif scan.noise:
-            yield FindingCode.FOREIGN_BYTES(port=config.port, baud=scan.baud)
-        elif others:
-            yield FindingCode.MORE_SERVOS(found=others)
-        else:
-            yield FindingCode.ONLY_SERVO()
+    (scan,) = scan_servos(wire, context.computer.clock, [config.baud])
+    others = [servo for servo in scan.servos if servo.bus_id != config.id]
+    if scan.duplicate_ids:
+        return duplicate_id(config.port, scan)
+    if scan.noise:
+        return foreign_bytes(config.port, scan)
+    if others:
+        return fine("more_servos", "also on the bus, not checked: {found}", found=others)
+    return fine("only_servo", "the only servo on its bus")
 
 
 def duplicate_id(port: str, scan: BaudScan) -> Finding:
@@ -123,42 +116,67 @@ def duplicate_id(port: str, scan: BaudScan) -> Finding:
     taken = {servo.bus_id for servo in scan.servos} | set(scan.duplicate_ids)
     free_id = next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
     fix = ("Unplug one of the two, then", Do.SERVO_ID(id=free_id))
-    return FindingCode.DUPLICATE_ID(fix, port=port, ids=scan.duplicate_ids, baud=scan.baud)
+    text = "{port}: two servos answer at once to id {ids} at {baud} baud (or the connection is very bad)"
+    return bad("duplicate_id", text, fix, port=port, ids=scan.duplicate_ids, baud=scan.baud)
+
+
+def foreign_bytes(port: str, scan: BaudScan) -> Finding:
+    """Return the finding that something else than a servo sends on a bus."""
+    text = "{port}: bytes at {baud} baud that belong to no servo: another program or adapter, or a loose contact"
+    fix = ("Remove everything but servos from the bus, then", Do.DOCTOR())
+    return warning("foreign_bytes", text, fix, port=port, baud=scan.baud)
 
 
 def _settings(found: DynamixelServo) -> Iterator[Finding]:
     differences = found.setting_differences()
     if not differences:
-        yield FindingCode.SETTINGS_CORRECT()
+        yield fine("settings_correct", "its permanent settings (EEPROM) are as required")
     for difference in differences:
         values = {"register": difference.register, "found": difference.found, "wanted": difference.wanted}
-        yield FindingCode.SETTING_DIFFERS(difference=difference, **values)
+        yield bad("setting_differs", "EEPROM {difference}", Do.SERVO_SETTINGS(), difference=difference, **values)
 
 
 def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
     state, limits, safety = found.read_state(), found.limits, context.config.safety
     condition = found.read_condition()
+    # What an earlier program left behind.
     if condition.hardware_errors:
-        yield FindingCode.HARDWARE_ERROR(hardware_errors=condition.hardware_errors)
+        text = "reports a hardware error: {hardware_errors}; torque stays off until it restarts"
+        yield bad("hardware_error", text, Do.ACKNOWLEDGE(reboot=True), hardware_errors=condition.hardware_errors)
     if condition.watchdog_tripped:
-        yield FindingCode.WATCHDOG_TRIPPED()
+        text = "its watchdog tripped: a program ended during a rotation"
+        yield warning("watchdog_tripped", text, Do.STATUS())
     if condition.torque:
-        yield FindingCode.TORQUE_ON()
+        yield warning("torque_on", "its torque is on although no program uses it", Do.STOP())
+    # Supply and temperature, unless its sensors are broken.
     low, high = limits.voltage_v
     if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
-        values = {"voltage_v": state.voltage_v, "temperature_c": state.temperature_c}
-        yield FindingCode.IMPOSSIBLE_VALUES(**values)
+        text = "reports impossible values: {voltage_v:.1f} V and {temperature_c:.0f} °C"
+        fix = "Replace the servo, or its cable if another servo reports the same"
+        yield bad("impossible_values", text, fix, voltage_v=state.voltage_v, temperature_c=state.temperature_c)
         return
     beyond_v = max(low - state.voltage_v, state.voltage_v - high)
-    level = graded(bad=beyond_v > 0, warning=beyond_v > -safety.voltage_margin_v)
-    supply = {"voltage_v": state.voltage_v, "low_v": low, "high_v": high}
-    yield FindingCode.SUPPLY((), level, **supply)
-    level = graded(bad=state.temperature_c >= limits.temperature_c - safety.temperature_margin_c)
-    temperature = {"temperature_c": state.temperature_c, "limit_c": limits.temperature_c}
-    yield FindingCode.TEMPERATURE((), level, **temperature)
+    yield graded(
+        "supply",
+        "supply {voltage_v:.1f} V (the servo shuts down outside {low_v:.1f}–{high_v:.1f} V)",
+        "Check the power supply and its plug",
+        is_bad=beyond_v > 0,
+        is_warning=beyond_v > -safety.voltage_margin_v,
+        voltage_v=state.voltage_v,
+        low_v=low,
+        high_v=high,
+    )
+    yield graded(
+        "temperature",
+        "temperature {temperature_c:.0f} °C (the servo shuts down above {limit_c:.0f} °C)",
+        "Let it cool, and find out why the table is hard to rotate",
+        is_bad=state.temperature_c >= limits.temperature_c - safety.temperature_margin_c,
+        temperature_c=state.temperature_c,
+        limit_c=limits.temperature_c,
+    )
 
 
-def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Iterator[Finding]:
+def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Finding:
     clock = context.computer.clock
     before = found.bus_statistics
     ticks = _ticks(found)
@@ -168,18 +186,20 @@ def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Iterator[Find
     each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
     after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
-        yield FindingCode.SERVO_FROZEN(tick_ms=ticks, readings=READS)
-        return
+        text = "frozen: its own clock stood at {tick_ms} ms during {readings} readings: its readings are not valid"
+        fix: SomeSteps = ("Switch the servo's supply off and on, then", Do.DOCTOR())
+        return bad("servo_frozen", text, fix, tick_ms=ticks, readings=READS)
     again = after["retries"] - before["retries"]
-    quality = {"readings": READS, "reading_ms": each_ms, "retries": again}
-    if again > REPEATED:
-        yield FindingCode.READINGS(**quality)
-    elif each_ms > SLOW * 1e3 * context.config.table.poll_s:
+    quality: dict[str, Any] = {"readings": READS, "reading_ms": each_ms, "retries": again}
+    text = "{readings} readings of {reading_ms:.1f} ms each, {retries} repeated"
+    if again <= REPEATED and each_ms > SLOW * 1e3 * context.config.table.poll_s:
         port = context.computer.serial_port(context.config.servo.port)
-        fix = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
-        yield FindingCode.SLOW_READINGS(fix or Do.SERVO_BAUD(baud=1000000), **quality)
-    else:
-        yield FindingCode.READINGS((), Severity.FINE, **quality)
+        fix = Do.SERVO_BAUD(baud=1000000)
+        if port and (port.latency_ms or 0) > 1:
+            fix = f"echo 1 | sudo tee {port.latency_file}"
+        return warning("slow_readings", f"{text}: slow", fix, **quality)
+    fix = "Check the plugs of the servo's cable"
+    return graded("readings", text, fix, is_warning=again > REPEATED, **quality)
 
 
 def _ticks(found: DynamixelServo) -> int | None:

@@ -17,10 +17,11 @@ from rig.config import RigConfig
 from rig.core.errors import ConfigError, RigError
 from rig.core.json_form import plain
 from rig.core.masking import masked
+from rig.core.next_steps import Do
 from rig.doctor import examination
 from rig.doctor.checks import CHECKS
-from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, ReportedFinding, Severity, of_error
+from rig.doctor.examination import DoctorContext
+from rig.doctor.finding import Finding, Severity, bad, fine, of_error
 from rig.jobs.desk import JobResult, Steps
 from rig.safety.saved_state import FileStore
 
@@ -33,7 +34,7 @@ class Examined:
     bad: int
     warnings: int
     exit_code: int
-    findings: list[ReportedFinding]
+    findings: list[dict[str, Any]]
 
 
 def check_configuration(
@@ -45,10 +46,13 @@ def check_configuration(
     except ConfigError as error:
         mistakes = error.evidence.get("mistakes") or [f"{key}: {value}" for key, value in error.evidence.items()]
         what = error.what.rstrip(".")
-        found = (FindingCode.CONFIG_MISTAKE(what=what, mistake=mistake) for mistake in mistakes or [error.what])
+        text, fix = "{what}: {mistake}", Do.CHECK_CONFIGURATION()
+        found = (bad("config_mistake", text, fix, what=what, mistake=one) for one in mistakes or [error.what])
         return None, tuple(replace(one, topic="config", exit_code=error.exit_code) for one in found)
-    code = FindingCode.CONFIG_VALID if path else FindingCode.CONFIG_MISSING
-    return config, (replace(code(path=path), topic="config"),)
+    code, text = "config_missing", "no rig.toml: the defaults are used (rig setup writes a file)"
+    if path:
+        code, text = "config_valid", "{path}: no mistakes"
+    return config, (replace(fine(code, text, path=path), topic="config"),)
 
 
 def examine(
@@ -97,7 +101,7 @@ def _findings(
 
 
 def support_bundle(
-    findings: Sequence[ReportedFinding],
+    findings: Sequence[dict[str, Any]],
     load: Callable[[], RigConfig],
     file: Path | None,
     bench: str | None,

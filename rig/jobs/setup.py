@@ -8,9 +8,8 @@ from typing import Any, Final
 from rig.config import RigConfig, load_config
 from rig.config.toml_file import Key, read_text, save, stated, with_values
 from rig.config.wording import blank_file
-from rig.doctor.context import DoctorContext
 from rig.doctor.device_scan import DeviceScan
-from rig.doctor.examination import run_checks
+from rig.doctor.examination import DoctorContext, run_checks
 from rig.doctor.finding import Finding
 from rig.jobs.desk import JobResult, Remark, Steps
 

@@ -17,7 +17,7 @@ from rig.devices.camera import Camera
 from rig.devices.imu import Imu, open_imu
 from rig.devices.servo import ServoState
 from rig.doctor.camera import open_camera
-from rig.doctor.context import DoctorContext
+from rig.doctor.examination import DoctorContext
 from rig.safety.saved_state import ServerAddress, server_address
 
 

@@ -21,8 +21,8 @@ from rig.core.errors import UsageError
 from rig.core.json_form import plain
 from rig.core.next_steps import NextSteps, as_steps
 from rig.core.plugins import plugins
-from rig.doctor.context import open_context
-from rig.doctor.finding import Finding, finding_words
+from rig.doctor.examination import open_context
+from rig.doctor.finding import Finding
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ranked, Started, event_dict
 from rig.events.wording import next_steps, page_line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Step, Steps
@@ -135,8 +135,8 @@ class ServedDesk(Desk):
                 self._note(text, as_steps(steps)) if event is None else self.show(event)
             case Progress(words=text):
                 self._note(text)
-            case Finding(topic=topic):
-                self._note(f"{topic}: {finding_words(step)}")
+            case Finding():
+                self._note(f"{step.topic}: {step.words}")
             case JobResult():
                 self.job.result, self.job.result_text = step.values, step.text
             case _:

@@ -9,7 +9,6 @@ from rig.config import load_config
 from rig.config.imus import imu_kinds
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.devices.imu import open_imu
-from rig.doctor.bus_scan import scan_imus
 from rig.doctor.device_scan import DeviceScan
 from rig.events.events import Moved
 from sim.bench import ShelfOperator, open_sim_bench
@@ -45,8 +44,9 @@ def test_new_imu_measures_the_rotations_of_an_enrollment(tmp_path):
 
 def test_search_and_doctor_name_the_new_imu():
     with unopened(CHOSEN) as bench:
-        (found,) = scan_imus(bench.context.computer, 1)
-        (candidate,) = DeviceScan(imus=[found]).candidates["IMU"]
+        scan = DeviceScan()
+        assert [found.code for found in scan.find_imus(bench.context)] == ["imu_found"]
+        (candidate,) = scan.candidates["IMU"]
         assert candidate == {("imu", "model"): "lsm6dsox", ("imu", "bus"): 1, ("imu", "address"): 0x6A}
         assert not bench.problems("imu")
         bench.devices.i2c.detach(0x6A)

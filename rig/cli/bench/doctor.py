@@ -23,7 +23,7 @@ from rig.config import RigConfig
 from rig.config.values import FILE_NAME, default_path
 from rig.core.errors import RigError, UsageError
 from rig.doctor.computer import udev_rules
-from rig.doctor.finding import Finding, Severity, finding_words
+from rig.doctor.finding import Finding, Severity
 from rig.jobs import setup as setup_jobs
 from rig.jobs.desk import JobResult, Remark, Steps
 from rig.jobs.doctor import Examined, check_configuration, examine, support_bundle
@@ -150,7 +150,7 @@ def print_finding(screen: Console, finding: Finding) -> None:
     """Print a finding: its mark, its topic, its text, and below it the fix."""
     marks = {Severity.FINE: ("✓", "green"), Severity.WARNING: ("!", "yellow"), Severity.BAD: ("✗", "bold red")}
     width = max(screen.width - _INDENT, 24) if screen.is_terminal else 10_000
-    first, *more = wrap(finding_words(finding), width, break_on_hyphens=False) or [""]
+    first, *more = wrap(finding.words, width, break_on_hyphens=False) or [""]
     screen.print(Text.assemble(marks[finding.level], f" {finding.topic:{_TOPIC_WIDTH}s}{first}"), soft_wrap=True)
     for line in more:
         screen.print(Text(" " * _INDENT + line), soft_wrap=True)

@@ -19,9 +19,9 @@ from rig.core.next_steps import Do
 from rig.core.phrases import counted
 from rig.devices.dynamixel import settings as servo_settings
 from rig.devices.trace import read_trace
-from rig.doctor.context import DoctorContext, open_context
+from rig.doctor.examination import DoctorContext, open_context
 from rig.doctor.replay import replay_devices, replay_drivers
-from rig.doctor.single_servo import SingleServo, single_servo
+from rig.doctor.servo_scan import SingleServo, single_servo
 from rig.jobs.trace import REACH_DEG
 from rig.jobs.trace import record as record_job
 
@@ -42,7 +42,8 @@ def settings_(
 
     Example: rig servo settings --write --bench sim
     """
-    with settings.open_parts() as context, single_servo(context, show_progress) as servo:
+    show_progress("searching for the servo ...")
+    with settings.open_parts() as context, single_servo(context) as servo:
         show_progress("")
         differences = servo_settings.compare(servo.bus, servo.found.bus_id, servo.table, context.config.table.mode)
         if not settings.json:
@@ -147,7 +148,8 @@ def replay_(
 
 def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
 
-    with settings.open_parts() as context, single_servo(context, show_progress) as servo:
+    show_progress("searching for the servo ...")
+    with settings.open_parts() as context, single_servo(context) as servo:
         show_progress("")
         old = servo.found.bus_id if what == "id" else servo.found.baud
         if not settings.json:

@@ -18,7 +18,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import RigError
 from rig.core.next_steps import in_words
 from rig.core.notify import notify_of_job, print_note
-from rig.doctor.finding import Finding, finding_words
+from rig.doctor.finding import Finding
 from rig.events.events import Enrolled, Event, Identified, event_dict
 from rig.events.wording import line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Steps
@@ -102,7 +102,7 @@ class CommandDesk(Desk):
                         values = {"event": "progress", "share": progress.share, "words": progress.words}
                         self._settings.say(progress.words, values)
                     case Finding() as finding:
-                        self._settings.say(finding_words(finding), finding.reported)
+                        self._settings.say(finding.words, finding.reported)
                     case event if show is not None:
                         show(event)
                     case event:

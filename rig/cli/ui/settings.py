@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rig.catalog import Catalog
     from rig.config import RigConfig
     from rig.config.catalog_place import CatalogPlace
-    from rig.doctor.context import DoctorContext
+    from rig.doctor.examination import DoctorContext
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Settings:
     def open_parts(self, *, default: bool = False) -> "Iterator[DoctorContext]":
         """Yield the bench with its devices closed, for the doctor; ``default`` ignores the configuration file."""
         from rig.config import RigConfig
-        from rig.doctor.context import open_context
+        from rig.doctor.examination import open_context
 
         config = RigConfig() if default else self.load()
         file_options = ("--config", str(self.config)) if self.config else ()

@@ -29,7 +29,7 @@ RIG = "from rig.cli.main import main\nmain()\n"
 IMPORTED = (
     *("rig.bench.hardware", "rig.catalog", "rig.catalog.results", "rig.cli.main", "rig.cli.ui.live"),
     *("rig.cli.ui.prompts", "rig.cli.ui.present", "rig.doctor.checks", "rig.doctor.device_scan"),
-    *("rig.doctor.single_servo", "rig.jobs.stop", "rig.plans.enroll", "rig.plans.identify"),
+    *("rig.doctor.servo_scan", "rig.jobs.stop", "rig.plans.enroll", "rig.plans.identify"),
     *("rig.plans.photograph_table", "rig.plans.tray"),
     *("rig.report.pictures", "rig.search.model", "dynamixel_easy_sdk"),
     *("rich._emoji_codes", "typer._adapters"),

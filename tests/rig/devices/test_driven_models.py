@@ -15,7 +15,6 @@ from rig.devices.dynamixel.registers import control_table, model_numbers
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.servo import MotionProfile
 from rig.doctor.device_scan import DeviceScan
-from rig.doctor.finding import FindingCode
 from sim.noise import NoiseModel
 from tests.rig.bench_parts import open_bus, servo_wires
 from tests.rig.doctor.doctor_parts import unopened
@@ -190,13 +189,13 @@ def test_scan_and_doctor_report_a_servo_that_the_rig_cannot_drive(number, name):
     with unopened() as bench:
         bench.devices.servo.memory["Model Number"] = number
         scan = DeviceScan()
-        (found,) = (one for one in scan.find_servos(bench.context) if not isinstance(one, str))
-        assert (found.code, str(found.parameters["found"]).partition(",")[0]) == (FindingCode.SERVO_NOT_DRIVEN, name)
+        (found,) = scan.find_servos(bench.context)
+        assert (found.code, str(found.evidence["found"]).partition(",")[0]) == ("servo_not_driven", name)
         assert "X series" in found.fix
         assert scan.settings == {}
         problem = bench.problem("servo")
-        assert "cannot drive" in problem.parameters["what"]
+        assert "cannot drive" in problem.evidence["what"]
         assert "X series" in problem.fix  # not `rig config set servo.model`
         bench.context.config = load_config(None, ["servo.id=9"])
         other = bench.problem("servo")
-        assert (other.code, other.fix) == (FindingCode.OTHER_SERVOS, found.fix)
+        assert (other.code, other.fix) == ("other_servos", found.fix)

@@ -16,7 +16,6 @@ from rig.devices.opencv_camera import OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from rig.devices.picamera2_capture import Picamera2Capture, camera_number
 from rig.doctor.device_scan import DeviceScan
-from rig.doctor.finding import FindingCode
 from rig.safety.saved_state import MemoryStore
 from sim.camera import SimCapture
 from sim.objects.shelf import shelf
@@ -211,12 +210,12 @@ def test_sensor_on_the_ribbon_cable_is_recognised_and_not_opened(receiver, monke
         monkeypatch.setitem(sys.modules, "picamera2", None)
         scan = DeviceScan()
         (found,) = scan.find_cameras(bench.context)
-        assert (found.code, found.parameters["name"]) == (FindingCode.RIBBON_CAMERA_UNREACHABLE, "imx708")
+        assert (found.code, found.evidence["name"]) == ("ribbon_camera_unreachable", "imx708")
         assert "python3-picamera2" in found.fix
         monkeypatch.setitem(sys.modules, "picamera2", ModuleType("picamera2"))
         (found,) = scan.find_cameras(bench.context)
-        assert (found.code, found.parameters["number"]) == (FindingCode.RIBBON_CAMERA, 0)
-        assert DeviceScan(ribbons=[0]).settings == {("camera", "source"): "picamera2:0"}
+        assert (found.code, found.evidence["number"]) == ("ribbon_camera", 0)
+        assert scan.candidates["camera"][-1] == {("camera", "source"): "picamera2:0"}
 
 
 @pytest.mark.parametrize(
@@ -252,9 +251,9 @@ def test_any_failure_of_the_import_is_an_error_and_a_finding_with_its_fix(
         bench.computer.camera(0, "rp1-cfe-csi2_ch0")
         bench.computer.write("sys/class/video4linux/v4l-subdev0/name", "imx708 10-001a\n")
         (found,) = DeviceScan().find_cameras(bench.context)  # rig find
-        assert (found.code, found.parameters["reason"]) == (FindingCode.RIBBON_CAMERA_UNREACHABLE, reason)
+        assert (found.code, found.evidence["reason"]) == ("ribbon_camera_unreachable", reason)
         assert fix in found.fix
         monkeypatch.setattr(bench.context.computer, "open_capture", open_capture)
         problem = bench.problem("camera")  # rig doctor
-        assert (problem.code, problem.parameters["reason"]) == (FindingCode.ERROR, reason)
+        assert (problem.code, problem.evidence["reason"]) == ("error", reason)
         assert fix in problem.fix

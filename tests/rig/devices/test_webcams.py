@@ -14,8 +14,7 @@ from rig.devices import v4l2
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.opencv_capture import V4l2Capture, limits_of
 from rig.devices.v4l2 import CAPTURE, VideoMode, choose_mode
-from rig.doctor.device_scan import FoundCamera, camera_settings
-from rig.doctor.finding import FindingCode, finding_words
+from rig.doctor.device_scan import camera_settings
 from sim.world import World
 from tests.kernel.usb.video import Video
 from tests.rig.devices.test_v4l2 import driver
@@ -120,15 +119,15 @@ def test_doctor_names_what_a_camera_lacks_with_the_setting_that_accepts_it(world
     with unopened() as bench:
         bench.devices.camera = ModelledWebcam(bench.devices.world, WEBCAMS["trust_webcam"])
         found = bench.findings("camera")
-        assert FindingCode.NOT_LOCKED not in {one.code for one in found}
-        problems = {one.parameters["setting"]: one for one in found if one.code is FindingCode.SETTING_REJECTED}
+        assert "not_locked" not in {one.code for one in found}
+        problems = {one.evidence["setting"]: one for one in found if one.code == "setting_rejected"}
         assert list(problems) == ["exposure_100us", "white_balance_k"]
         assert problems["exposure_100us"].steps[-1] == Do.SET_KEY(key="camera.exposure_us", value="none")
     with unopened("camera.fourcc=HEVC") as bench:
         bench.devices.camera = ModelledWebcam(bench.devices.world, WEBCAMS["elp_h265"])
-        problem = next(one for one in bench.findings("camera") if one.code is FindingCode.MODE_NOT_OFFERED)
+        problem = next(one for one in bench.findings("camera") if one.code == "mode_not_offered")
         assert problem.steps == (Do.SET_KEY(key="camera.fourcc", value="none"),)
-        assert "(HEVC); nearest: 640x480 at 30 frames/s (YUYV)" in finding_words(problem)
+        assert "(HEVC); nearest: 640x480 at 30 frames/s (YUYV)" in problem.words
 
 
 class Decodes(ModelledWebcam):
@@ -165,7 +164,7 @@ def test_cameras_without_names_and_with_one_id_are_distinguished() -> None:
         cameras = computer.cameras()
         assert [node.path for node in cameras] == [f"/dev/video{2 * number}" for number in range(len(WEBCAMS))]
         assert cameras[4].name == "UVC Camera (046d:0825)"
-        assert len({str(camera_settings(FoundCamera(node, 640, 480, 30.0))) for node in cameras}) == len(WEBCAMS)
+        assert len({str(camera_settings(node)) for node in cameras}) == len(WEBCAMS)
         devices = [Computer.camera_device(computer, node.path) for node in cameras]
         assert len(set(devices)) == len(WEBCAMS)
         assert devices[1] == "USB 0c45:6340 (canyon_cne_cwc2) at usb-1-1-video-index0"

@@ -11,9 +11,8 @@ from rig.bench.computer import User
 from rig.config import load_config
 from rig.core.next_steps import NextSteps
 from rig.doctor.checks import CHECKS
-from rig.doctor.context import DoctorContext
-from rig.doctor.examination import run_checks
-from rig.doctor.finding import Finding, FindingCode, Severity
+from rig.doctor.examination import DoctorContext, run_checks
+from rig.doctor.finding import Finding, Severity
 from sim.clock import VirtualClock
 from sim.computer import ComputerFiles, SimComputer
 from sim.devices import SimDevices
@@ -41,7 +40,7 @@ class Bench:
         """Check the bench, or some topics of it."""
         return list(run_checks(self.context, [check for check in CHECKS if not topics or check.topic in topics]))
 
-    def problems(self, *topics: str) -> dict[FindingCode, NextSteps]:
+    def problems(self, *topics: str) -> dict[str, NextSteps]:
         """Return the warnings and bad findings: the code of each, and what fixes it."""
         return {f.code: f.steps for f in self.findings(*topics) if f.level is not Severity.FINE}
 

@@ -12,8 +12,8 @@ from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, DeviceSilent
 from rig.core.next_steps import Do
 from rig.doctor.computer import RULES_FILES, udev_rules
-from rig.doctor.finding import FindingCode, Severity, finding_words
-from rig.doctor.single_servo import single_servo
+from rig.doctor.finding import Severity
+from rig.doctor.servo_scan import single_servo
 from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
 from rig.safety.saved_state import BenchState as State
 from sim.clock import VirtualClock
@@ -29,15 +29,15 @@ def test_latency_timer_is_fixed_by_one_command():
         bench.computer.i2c_bus()
         bench.computer.camera()
         problem = bench.problem("port")
-        assert (problem.code, problem.parameters["latency_ms"]) == (FindingCode.HIGH_LATENCY, 16)
+        assert (problem.code, problem.evidence["latency_ms"]) == ("high_latency", 16)
         assert problem.fix == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
 
 
 @pytest.mark.parametrize(
     ("members", "code", "command"),
     [
-        ((), FindingCode.NOT_IN_GROUP, "sudo usermod -aG dialout ada"),
-        (("ada",), FindingCode.GROUP_AT_NEXT_LOGIN, "newgrp dialout"),
+        ((), "not_in_group", "sudo usermod -aG dialout ada"),
+        (("ada",), "group_at_next_login", "newgrp dialout"),
     ],
 )
 def test_missing_permission_names_the_group_or_the_new_login(members, code, command):
@@ -48,7 +48,7 @@ def test_missing_permission_names_the_group_or_the_new_login(members, code, comm
         bench.computer.camera(mode=0o666)
         problem = bench.problem("port")
         assert (problem.code, problem.fix) == (code, command)
-        assert (problem.parameters["user"], problem.parameters["path"]) == ("ada", "/dev/ttyUSB0")
+        assert (problem.evidence["user"], problem.evidence["path"]) == ("ada", "/dev/ttyUSB0")
 
 
 def test_port_of_root_is_fixed_by_udev_rules():
@@ -58,7 +58,7 @@ def test_port_of_root_is_fixed_by_udev_rules():
         bench.computer.i2c_bus(mode=0o666)
         bench.computer.camera(mode=0o666)
         problem = bench.problem("port")
-        assert problem.code is FindingCode.ROOT_ONLY
+        assert problem.code == "root_only"
         assert problem.fix.startswith("rig doctor --udev --bench sim | sudo tee /etc/udev/rules.d/")
         rules = udev_rules(bench.context.computer.serial_ports())
         assert 'ATTR{latency_timer}="1"' in rules
@@ -84,7 +84,7 @@ def test_missing_port_is_explained_by_brltty():
         bench.computer.camera()
         bench.computer.process(77, "/usr/bin/brltty -b hd")
         problem = bench.problem("port")
-        assert (problem.code, problem.fix) == (FindingCode.BRLTTY_TAKES_PORT, "sudo apt remove brltty")
+        assert (problem.code, problem.fix) == ("brltty_takes_port", "sudo apt remove brltty")
 
 
 def test_port_that_modem_manager_will_open_is_reported(bench):
@@ -92,7 +92,7 @@ def test_port_that_modem_manager_will_open_is_reported(bench):
     assert bench.problems("port") == {}
     bench.computer.process(78, "/usr/sbin/ModemManager")
     problem = bench.problem("port")
-    assert problem.code is FindingCode.MODEM_MANAGER
+    assert problem.code == "modem_manager"
     assert "udevadm trigger" in problem.fix
     node = (bench.computer.root / "dev/ttyUSB0").stat().st_rdev
     bench.computer.write(f"run/udev/data/c{os.major(node)}:{os.minor(node)}", "S:rig-servo\nE:ID_MM_PORT_IGNORE=1\n")
@@ -129,8 +129,8 @@ def test_bench_is_not_opened_while_another_program_has_the_port_open(bench):
 def test_port_in_use_names_the_process(command, fix, bench):
     bench.computer.process(77, command, "/dev/ttyUSB0")
     problem = bench.problem("port")
-    assert (problem.code, problem.fix) == (FindingCode.DEVICE_FILE_IN_USE, fix)
-    assert f"in use by process 77 ({command})" in finding_words(problem)
+    assert (problem.code, problem.fix) == ("device_file_in_use", fix)
+    assert f"in use by process 77 ({command})" in problem.words
 
 
 def test_other_port_is_proposed_by_its_permanent_name():
@@ -156,9 +156,9 @@ def test_bench_in_use_is_not_touched(bench):
     findings = bench.findings()
     lock.close()
     warnings = {f.topic: f for f in findings if f.level is Severity.WARNING}
-    assert warnings["bench"].code is FindingCode.BENCH_IN_USE
-    assert warnings["bench"].parameters["pid"] == os.getpid()
-    assert {warnings[topic].code for topic in ("servo", "imu", "camera")} == {FindingCode.NOT_CHECKED}
+    assert warnings["bench"].code == "bench_in_use"
+    assert warnings["bench"].evidence["pid"] == os.getpid()
+    assert {warnings[topic].code for topic in ("servo", "imu", "camera")} == {"not_checked"}
     assert warnings["servo"].fix == "Stop the table and switch its torque off: `rig stop --bench sim`."
     assert not bench.sent
 
@@ -168,13 +168,13 @@ def test_latched_fault_and_damaged_state_are_reported(bench):
     utc = "2026-05-01T10:00:00+00:00"
     store.save(State(fault=LatchedFault.of(DeviceSilent("Servo 1 is gone.", next_step="Look."), utc)))
     problem = bench.problem("bench")
-    assert (problem.code, problem.parameters["code"]) == (FindingCode.FAULT_LATCHED, 402)
-    assert problem.parameters["detail"] == "Servo 1 is gone."
+    assert (problem.code, problem.evidence["code"]) == ("fault_latched", 402)
+    assert problem.evidence["detail"] == "Servo 1 is gone."
     assert problem.steps == (Do.ACKNOWLEDGE(),)
     store.latch(None)
     (store.path / "state.json").write_text("{")
     problem = bench.problem("bench")
-    assert problem.code is FindingCode.STATE_DAMAGED
+    assert problem.code == "state_damaged"
     assert problem.steps[1:4:2] == (Do.ACKNOWLEDGE(), Do.SET_REVOLUTIONS(revolutions=0))
 
 
@@ -182,33 +182,33 @@ def test_latched_fault_and_damaged_state_are_reported(bench):
 def test_free_space_is_reported_in_objects(monkeypatch, free, level, bench):
     monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: Disk(int(free), network=False))
     (finding,) = bench.findings("disk")
-    assert (finding.code, finding.level) == (FindingCode.FREE_SPACE, level)
-    assert finding.parameters["objects"] == int(free / 500_000) // 72
+    assert (finding.code, finding.level) == ("free_space", level)
+    assert finding.evidence["objects"] == int(free / 500_000) // 72
 
 
 @pytest.mark.parametrize(
     ("disk", "code", "fixed_by"),
     [
-        (Disk(10**11, network=True), FindingCode.NETWORK_DISK, ""),
-        (Disk(10**11, network=False, writable=False), FindingCode.NOT_WRITABLE, "rig config set catalog.path FOLDER"),
+        (Disk(10**11, network=True), "network_disk", ""),
+        (Disk(10**11, network=False, writable=False), "not_writable", "rig config set catalog.path FOLDER"),
     ],
 )
 def test_network_disk_and_read_only_folder_are_reported(monkeypatch, disk, code, fixed_by, bench):
     monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: disk)
     problem = bench.problem("disk")
-    assert problem.code is code
+    assert problem.code == code
     assert fixed_by in problem.fix
 
 
 def test_unsynchronised_clock_is_a_warning_and_wrong_date_is_bad():
     with unopened(plugged=False) as bench:
-        assert bench.problem("clock").code is FindingCode.NO_TIME_SERVER
+        assert bench.problem("clock").code == "no_time_server"
         bench.computer.keeps_time(synchronised=False)
         problem = bench.problem("clock")
-        assert problem.code is FindingCode.NOT_SYNCHRONIZED
+        assert problem.code == "not_synchronized"
         assert problem.fix == "sudo timedatectl set-ntp true"
         bench.computer.keeps_time()
         assert not bench.problems("clock")
         bench.context.computer.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
         (wrong,) = [f for f in bench.findings("clock") if f.level is Severity.BAD]
-        assert wrong.code is FindingCode.WRONG_DATE
+        assert wrong.code == "wrong_date"

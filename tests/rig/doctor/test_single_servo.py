@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rig.config.servos import known_model, model_numbers
 from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, RequestRejected, SeveralServos, UsageError
 from rig.devices.dynamixel.registers import control_table
-from rig.doctor.single_servo import baud_codes, single_servo
+from rig.doctor.servo_scan import baud_codes, single_servo
 from rig.safety.saved_state import Holder
 from tests.fuzzing import fuzz_settings
 from tests.rig.doctor.doctor_parts import unopened

@@ -38,7 +38,7 @@ def parts(home, monkeypatch):
                 bench.context.computer.simulated = False  # it stands for a real bench
                 yield bench.context.computer
 
-        monkeypatch.setattr("rig.doctor.context.bench_kind", lambda _: Kind())
+        monkeypatch.setattr("rig.doctor.examination.bench_kind", lambda _: Kind())
         yield bench
 
 
