@@ -1,57 +1,106 @@
-"""The REST API: logins, the lease, state, STOP, events, pictures, jobs."""
+"""The REST API: logins, the lease, state, STOP, events, pictures, jobs, and the shelf of a simulated bench."""
 
 import asyncio
 import json
 from base64 import b64decode
 from contextlib import aclosing
 from importlib.metadata import version
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
-from fastapi import Header, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import Body, Header, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import HTMLResponse, StreamingResponse
+from pydantic import AwareDatetime, BaseModel, Field
 
 from rig.core.errors import Forbidden, JobNotFound, TooManyListeners
 from rig.core.next_steps import Do
+from rig.motion.traces import stored
 from rig.motion.turntable import check_angle
-from rig.web.access import LOCAL, Person, Role
-from rig.web.answers import (
-    Deleted,
-    EventStream,
-    Health,
-    JobEvents,
-    JobMessage,
-    Jpeg,
-    LeaseState,
-    ListOf,
-    Login,
-    Me,
-    Move,
-    NewToken,
-    OtherBench,
-    ShelfState,
-    Status,
-    Stopped,
-    Svg,
-    TokenRow,
-)
-from rig.web.benches import BenchesInNetwork, OtherBenches
+from rig.plans.operator import Choice
+from rig.safety.saved_state import FileStore
+from rig.web.access import LOCAL, MAX_NAME, Person, Role
+from rig.web.answers import BenchStatus, Deleted, JobMessage, Jpeg, ListOf
+from rig.web.benches import BenchesInNetwork, OtherBench, OtherBenches
 from rig.web.hub import MAX_LISTENERS
-from rig.web.requests import AnswerBody, ByHand, GotoRequest, Job, JobRequest, JobState, LeaseBody, LoginBody, TokenBody
-from rig.web.server import (
-    API,
-    COOKIE,
-    Manager,
-    OperatorPerson,
-    Page,
-    Proposer,
-    Routes,
-    Server,
-    Watcher,
-)
+from rig.web.requests import GotoRequest, Job, JobRequest, JobState, RequestBody
+from rig.web.server import API, COOKIE, Manager, OperatorPerson, Page, Proposer, Routes, Server, Watcher, long_work
 
+Force = Annotated[bool, Body(embed=True, description="take it over from another operator, who is warned")]
 IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
+Words = Annotated[
+    list[Annotated[str, Field(max_length=100)]],
+    Body(
+        embed=True,
+        min_length=1,
+        max_length=4,
+        description="`put NAME`, `clear`, `light 0.5`, or `unplug` for the camera, word by word",
+    ),
+]
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
     201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
 }
+
+
+class Health(BaseModel):
+    """The health of the server."""
+
+    status: Literal["ok"] = "ok"
+    version: str
+    bench_open: bool
+
+
+class Login(BaseModel):
+    """Who is logged in: the name and the role of the token."""
+
+    name: str
+    role: Role
+
+
+class TokenRow(Login):
+    """A token without its secret.
+
+    ``expires_utc`` is null if it is always valid, ``used_utc`` if it was not used since the server started.
+    """
+
+    created_utc: AwareDatetime
+    expires_utc: AwareDatetime | None
+    used_utc: AwareDatetime | None
+
+
+class NewToken(Login):
+    """A new token. No other answer has its secret, ``token``."""
+
+    token: str
+
+
+class LeaseHolder(BaseModel):
+    """A person at a browser or program, which ``client`` distinguishes."""
+
+    name: str
+    client: str
+
+
+class LeaseState(BaseModel):
+    """Who operates the bench, and for how long without a request; ``taken_from`` had the lease before."""
+
+    holder: str | None
+    client: str | None
+    taken_from: LeaseHolder | None
+    seconds: float
+
+
+class Me(Login):
+    """Who is logged in, and who has the lease."""
+
+    has_lease: bool
+    lease: LeaseState
+
+
+class TokenBody(RequestBody):
+    """A token to be made."""
+
+    name: Annotated[str, Field(max_length=MAX_NAME, description="of the person or program that gets it")]
+    role: Role
+    days: Annotated[float | None, Field(ge=0.01, le=3650, description="how long it is valid; default: always")] = None
 
 
 def add_access(routes: Routes, server: Server) -> None:
@@ -61,9 +110,9 @@ def add_access(routes: Routes, server: Server) -> None:
         return Health(version=version("hbr-rig"), bench_open=bool(server.remote.status.get("open")))
 
     @routes.public.post("/login", tags=["access"])
-    def login(body: LoginBody, response: Response) -> Login:
+    def login(token: Annotated[str, Body(embed=True, max_length=200)], response: Response) -> Login:
         """Log in with a token; the answer sets a cookie."""
-        secret, person = server.sessions.login(body.token)
+        secret, person = server.sessions.login(token)
         secure = server.setup.listening.certfile is not None
         response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=secure, path="/")
         return Login(name=person.name, role=person.role)
@@ -83,9 +132,9 @@ def add_access(routes: Routes, server: Server) -> None:
         return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
 
     @routes.manage.post("/lease", tags=["access"], response_model=LeaseState)
-    def take_lease(body: LeaseBody, person: Manager) -> Any:
+    def take_lease(person: Manager, force: Force = False) -> Any:
         """Take or renew the lease."""
-        server.lease.take(person, force=body.force)
+        server.lease.take(person, force=force)
         return server.lease.as_json()
 
     @routes.watch.delete("/lease", tags=["access"], response_model=LeaseState)
@@ -129,6 +178,44 @@ def _require_login(person: Person, name: str) -> None:
             "A server that needs no login does not change tokens.",
             next_step=("At a terminal of the bench's computer:", Do.NEW_TOKEN(name=name)),
         )
+
+
+class CatalogState(BaseModel):
+    """Whether the catalog's server answers: else ``local_copy_utc`` is the time of the copy that is shown.
+
+    ``waiting`` changes are not delivered yet, for these ``reasons``.
+    """
+
+    local_copy_utc: str | None
+    waiting: int
+    reasons: list[str]
+
+
+class ServerState(BaseModel):
+    """The state of the server: the number of open streams of events."""
+
+    listeners: int
+
+
+class Status(BenchStatus):
+    """The state of the bench, of its server and of its catalog."""
+
+    server: ServerState
+    catalog: CatalogState
+
+
+class Stopped(BaseModel):
+    """The answer to STOP: with ``ended``, the torque is off. ``answer`` is null if the bench has not confirmed it."""
+
+    ended: bool
+    answer: str | None
+    status: BenchStatus
+
+
+class EventStream(StreamingResponse):
+    """Server-sent events."""
+
+    media_type = "text/event-stream"
 
 
 def add_bench(routes: Routes, server: Server) -> None:
@@ -198,10 +285,17 @@ def add_bench(routes: Routes, server: Server) -> None:
             raise JobNotFound("The camera has given no frame yet.", next_step="Try again in a second.")
         return Jpeg(content, headers={"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"})
 
-    @routes.watch.get("/moves/last", tags=["bench"], response_model=Move)
-    def get_last_move() -> Any:
-        """Return the last move of the last job that ended: encoder, servo profile, load and gyro over its time."""
-        return server.remote.call("last_move")
+    @routes.watch.get("/moves/report", tags=["bench"], response_class=HTMLResponse)
+    async def get_move_report() -> HTMLResponse:
+        """Return the report of the last moves as a page: encoder, servo profile, load and gyro over the time."""
+        from rig.report.motion import motion_report
+
+        setup = server.setup
+        moves = stored(FileStore(setup.state_folder))
+        if not moves:
+            raise JobNotFound("No move of the table is stored.", next_step="Rotate it, then ask again.")
+        quiet_dps = setup.config.table.quiet_dps
+        return HTMLResponse(await long_work(lambda: motion_report(moves, bench=setup.bench, quiet_dps=quiet_dps)))
 
 
 async def _send_events(server: Server, socket: WebSocket) -> None:
@@ -215,11 +309,26 @@ async def _send_events(server: Server, socket: WebSocket) -> None:
     await socket.close(1008)
 
 
+class JobEvents(BaseModel):
+    """The events of a job so far, as the messages ``plan`` of the stream, and the id after which a stream continues."""
+
+    items: list[dict[str, Any]]
+    last: str
+
+
+class AnswerBody(RequestBody):
+    """The answer to the question of a job; without ``sample``, the sample on the table has no name."""
+
+    choice: Choice = Choice.CONTINUE
+    sample: Annotated[str | None, Field(max_length=1000, description="for a question with takes_sample")] = None
+
+
 def add_jobs(routes: Routes, server: Server) -> None:
     @routes.watch.get("/jobs", tags=["jobs"], response_model=ListOf[Job])
     def list_jobs(page: Page, state: JobState | None = None) -> Response:
         """List the jobs, or those in one state, the newest first."""
-        return page.of([job for job in server.remote.call("jobs") if state in (None, job["state"])], "id")
+        jobs = [job for job in server.remote.call("jobs") if state in (None, job["state"])]
+        return page.of(jobs, lambda job: str(job["id"]))
 
     @routes.propose.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
     def submit_job(
@@ -273,11 +382,6 @@ def add_jobs(routes: Routes, server: Server) -> None:
         found = server.remote.call("view", job_id=job_id, number=number)
         return Jpeg(b64decode(found), headers={"Cache-Control": "private, max-age=3600"})
 
-    @routes.watch.get("/jobs/{job_id}/candidates", tags=["jobs"], response_class=Svg)
-    def get_job_candidates(job_id: str) -> Svg:
-        """Return the chart of the candidates of a recent search as SVG, after its last view."""
-        return Svg(server.remote.call("candidates", job_id=job_id), headers={"Cache-Control": "no-store"})
-
     @routes.watch.get("/jobs/{job_id}/events", tags=["jobs"], responses={200: {"model": JobEvents}})
     def get_job_events(job_id: str) -> Response:
         """Return the events of a recent job so far, and the id after which a stream continues."""
@@ -285,6 +389,15 @@ def add_jobs(routes: Routes, server: Server) -> None:
         events, last = server.hub.of_job(job_id)
         content = f'{{"items": [{", ".join(events)}], "last": "{last}"}}'
         return Response(content, media_type="application/json", headers={"Cache-Control": "no-store"})
+
+
+class ShelfState(BaseModel):
+    """A simulated bench: the ``things`` on its shelf, the ``object`` on the table, its light and its faults."""
+
+    things: list[str]
+    object: str | None
+    light: float
+    faults: list[str]
 
 
 def add_shelf(routes: Routes, server: Server) -> None:
@@ -296,9 +409,9 @@ def add_shelf(routes: Routes, server: Server) -> None:
         return server.remote.call("shelf")
 
     @routes.operate.post("/shelf", tags=["bench"], response_model=ShelfState)
-    def use_shelf(body: ByHand) -> Any:
+    def use_shelf(words: Words) -> Any:
         """Do something by hand at a simulated bench; the event `shelf` says what was done."""
-        return server.remote.call("by_hand", words=body.words)
+        return server.remote.call("by_hand", words=words)
 
     @routes.watch.get("/shelf/{name}", tags=["bench"], response_class=Jpeg)
     def get_thing(name: str) -> Jpeg:

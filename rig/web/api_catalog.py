@@ -2,44 +2,33 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 from anyio import open_file, to_thread
-from fastapi import Query, Request, Response
-from pydantic import Field
+from fastapi import Body, Query, Request, Response
+from fastapi.responses import StreamingResponse
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 from starlette.background import BackgroundTask
 
 from rig.catalog import Catalog, ObjectSummary
 from rig.catalog.derived import views
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
+from rig.catalog.facts import Action
 from rig.catalog.jobs import finished
 from rig.catalog.log import shown
-from rig.catalog.records import RecordedOutcome
+from rig.catalog.records import EnrollmentStatus, Provenance, RecordedOutcome
 from rig.catalog.results import Result, ResultFilter, ResultRow, correct, find_result, find_results
 from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
+from rig.events.events import SimilarObjects
 from rig.plans.enroll import similar_objects
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
-from rig.web.answers import (
-    Bundle,
-    CorrectionRow,
-    Deleted,
-    EnrollmentRow,
-    Jpeg,
-    ListedObject,
-    ListedResult,
-    ListOf,
-    LogRow,
-    ObjectRow,
-    ObjectWithViews,
-    ResultDetails,
-    ViewRow,
-    time_text,
-)
+from rig.web.answers import Deleted, Jpeg, ListOf
 from rig.web.picture import jpeg
-from rig.web.requests import CorrectionBody, NameBody, ObjectBody
+from rig.web.requests import RequestBody
 from rig.web.server import API, OperatorPerson, Page, Routes, Server, cached, long_work
 
 THUMB_PX: Final = 256  # larger: a long list loads slowly; smaller: blurred on dense screens
@@ -49,6 +38,53 @@ CHUNK_BYTES: Final = 65_536
 BYTES_PER_S: Final = 30_000_000
 Number = Annotated[int, Field(ge=0, lt=2**62)]
 Full = Annotated[bool, Query(description="the stored image instead of a small JPEG")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ListedObject(ObjectSummary):
+    """An object of a list; ``picture`` is the id of its first view."""
+
+    picture: int | None
+
+
+class EnrollmentRow(BaseModel):
+    """An enrollment of an object; ``sessions`` say on which bench, and with which software and calibrations."""
+
+    status: EnrollmentStatus
+    started_utc: AwareDatetime
+    finished_utc: AwareDatetime | None
+    planned_views: int
+    stored_views: int
+    sessions: list[Provenance]
+
+
+class ViewRow(BaseModel):
+    """A view of an object with the measurements of its checks; its image is at ``/views/{id}/image``."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    id: int
+    index: int
+    azimuth_deg: float
+    evidence: dict[str, Any]
+    captured_utc: AwareDatetime | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectWithViews(ObjectSummary):
+    """An object with its enrollments, the newest first, its views, and the objects that it resembles."""
+
+    enrollments: list[EnrollmentRow]
+    views_taken: list[ViewRow]
+    similar: SimilarObjects | None
+
+
+class ObjectBody(RequestBody):
+    """Changes of an object; what is missing stays."""
+
+    name: Annotated[str | None, Field(max_length=1000)] = None
+    label: Annotated[str | None, Field(max_length=1000)] = None
+    note: Annotated[str | None, Field(max_length=10_000)] = None
 
 
 def add_objects(routes: Routes, server: Server) -> None:
@@ -64,11 +100,11 @@ def add_objects(routes: Routes, server: Server) -> None:
             pictures = {} if deleted else catalog.first_views()
         wanted = search.casefold()
         rows = [
-            ListedObject(**_row(one), picture=pictures.get(one.name)).model_dump(mode="json")
+            ListedObject(**asdict(one), picture=pictures.get(one.name))
             for one in found
             if wanted in f"{one.name}\n{one.label}\n{one.note}".casefold()
         ]
-        return page.of(sorted(rows, key=lambda row: row["name"]), "name")
+        return page.of(sorted(rows, key=lambda row: row.name), lambda row: row.name)
 
     @routes.watch.get("/objects/{name:path}", tags=["catalog"])
     def get_object(name: str) -> ObjectWithViews:
@@ -88,20 +124,20 @@ def add_objects(routes: Routes, server: Server) -> None:
             for one in found.enrollments
         ]
         return ObjectWithViews(
-            **_row(found.summary),
+            **asdict(found.summary),
             enrollments=enrollments,
             views_taken=[ViewRow.model_validate(view) for view in found.views],
             similar=similar,
         )
 
     @routes.operate.patch("/objects/{name:path}", tags=["catalog"])
-    def change_object(name: str, body: ObjectBody, person: OperatorPerson) -> ObjectRow:
+    def change_object(name: str, body: ObjectBody, person: OperatorPerson) -> ObjectSummary:
         """Rename or label an object."""
         with server.catalog.open_to_change(person) as catalog:
             catalog.set_texts(name, label=body.label, note=body.note)
             if body.name is not None:
                 catalog.rename(name, body.name)
-            return ObjectRow.model_validate(catalog.summary(body.name or name))
+            return catalog.summary(body.name or name)
 
     @routes.operate.delete("/objects/{name:path}", tags=["catalog"])
     def delete_object(name: str, person: OperatorPerson) -> Deleted:
@@ -111,21 +147,19 @@ def add_objects(routes: Routes, server: Server) -> None:
         return Deleted(deleted=name)
 
     @routes.operate.post("/undelete", tags=["catalog"])
-    def restore_object(body: NameBody, person: OperatorPerson) -> ObjectRow:
+    def restore_object(
+        name: Annotated[str, Body(embed=True, max_length=1000)], person: OperatorPerson
+    ) -> ObjectSummary:
         """Restore a deleted object."""
         with server.catalog.open_to_change(person) as catalog:
-            catalog.undelete(body.name)
-            return ObjectRow.model_validate(catalog.summary(body.name))
+            catalog.undelete(name)
+            return catalog.summary(name)
 
     @routes.watch.get("/views/{view_id}/image", tags=["catalog"], response_class=Jpeg)
     def get_view_image(request: Request, view_id: Number, full: Full = False) -> Response:
         """Return the image of a view."""
         with server.catalog.open_to_read() as catalog:
             return _image(request, catalog, catalog.view(view_id).image, full=full)
-
-
-def _row(one: ObjectSummary) -> dict[str, Any]:
-    return ObjectRow.model_validate(one).model_dump()
 
 
 def _image(request: Request, catalog: Catalog, name: str, *, full: bool) -> Response:
@@ -151,6 +185,55 @@ def _result(catalog: Catalog, result_id: int) -> Result:
         raise JobNotFound(error.what, next_step=error.steps) from error
 
 
+class CorrectionRow(BaseModel):
+    """A correction of an answer, with the values after it."""
+
+    time_utc: AwareDatetime
+    operator: str
+    outcome: RecordedOutcome
+    object: str | None
+    sample: str | None
+    reason: str
+
+
+class ListedResult(ResultRow):
+    """A recorded answer of a list; ``id`` is its number as a text, for ``after``."""
+
+    id: str
+
+
+class ResultDetails(ResultRow):
+    """A recorded answer with its row, and the ``history`` of its corrections, the oldest first.
+
+    ``answer`` is the event `identified` as it was recorded.
+    """
+
+    answer: dict[str, Any]
+    history: list[CorrectionRow]
+
+
+class CorrectionBody(RequestBody):
+    """A correction of an answer; what is missing stays."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=1000)]
+    object: Annotated[str | None, Field(max_length=100)] = None
+    unknown: bool = Field(False, description="the object is an unknown one")
+    sample: Annotated[str | None, Field(max_length=100)] = None
+
+
+class LogRow(BaseModel):
+    """A line of the catalog's log; passwords in its ``details`` are hidden."""
+
+    id: str
+    time_utc: AwareDatetime
+    user: str
+    host: str
+    software: str
+    action: Action
+    object_name: str | None
+    details: dict[str, Any]
+
+
 def add_results(routes: Routes, server: Server) -> None:
     @routes.watch.get("/results", tags=["results"], response_model=ListOf[ListedResult])
     def list_results(
@@ -162,8 +245,8 @@ def add_results(routes: Routes, server: Server) -> None:
         """List the recorded answers, the newest first. Filters use the corrected values."""
         with server.catalog.open_to_read() as catalog:
             found = find_results(catalog, ResultFilter(sample, object_name, outcome))
-        rows = [{**one.as_row().model_dump(mode="json"), "id": str(one.id)} for one in found]
-        return page.of(rows[::-1], "id")
+        rows = [ListedResult(**dict(one.as_row()), id=str(one.id)) for one in found]
+        return page.of(rows[::-1], lambda row: row.id)
 
     @routes.watch.get("/results/{result_id}", tags=["results"])
     def get_result(result_id: Number) -> ResultDetails:
@@ -213,11 +296,17 @@ def add_results(routes: Routes, server: Server) -> None:
         """List the catalog's log, the newest first."""
         with server.catalog.open_to_read() as catalog:
             entries = catalog.log()
-        rows = [{**shown(entry), "id": str(entry.id), "time_utc": time_text(entry.time_utc)} for entry in entries]
-        return page.of(rows[::-1], "id")
+        rows = [LogRow.model_validate({**shown(one), "id": str(one.id), "time_utc": one.time_utc}) for one in entries]
+        return page.of(rows[::-1], lambda row: row.id)
 
 
 # -- bundles -----------------------------------------------------------------------------------------------------------
+
+
+class Bundle(StreamingResponse):
+    """A catalog in a file."""
+
+    media_type = "application/zip"
 
 
 class _Download:

@@ -1,15 +1,15 @@
 """The REST API: saved runs, calibrations and the configuration."""
 
 import re
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
-from fastapi import Response
+from fastapi import Body, Response
 from fastapi.responses import HTMLResponse, JSONResponse
-from pydantic import Field
+from pydantic import AwareDatetime, BaseModel, Field
 
 from rig.bench.changes import set_key
-from rig.calibrations import CalibrationStore, Estimate
-from rig.calibrations.result import COVERAGE_FACTOR
+from rig.calibrations import CalibrationStore
+from rig.calibrations.result import CalibrationResult, Contribution
 from rig.config import RigConfig
 from rig.config.toml_file import NONE, toml
 from rig.config.values import read_values
@@ -18,23 +18,9 @@ from rig.core.errors import ConfigError, Forbidden, JobNotFound, UsageError
 from rig.core.json_form import plain
 from rig.core.masking import masked
 from rig.core.next_steps import Do
-from rig.events.events import event_dict
-from rig.search.replay import ReplayCheck, check
+from rig.events.events import DESCRIBED, JsonEvent, event_dict
 from rig.search.saved_run import SavedRun, load_run
-from rig.web.answers import (
-    BudgetRow,
-    CalibrationRow,
-    Calibrations,
-    ListOf,
-    Quantity,
-    RunCheck,
-    RunName,
-    SavedRunBody,
-    Setting,
-    SettingChange,
-    Settings,
-)
-from rig.web.requests import SettingBody
+from rig.web.answers import ListOf
 from rig.web.server import Page, Routes, Server, long_work
 from rig.web.work import calibrations
 
@@ -42,6 +28,101 @@ CHANGED_BY_PAGES: Final = ("camera", "view", "enroll", "identify", "mark")
 """Sections that a page may change. A wrong value of another one can harm the bench or reach other files."""
 NOT_BY_PAGES: Final = ("camera.source",)
 RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+class RunName(BaseModel):
+    """The name of a saved run."""
+
+    name: str
+
+
+class SavedRunBody(BaseModel):
+    """The events of a saved run. Each also has ``text``: the event in words, empty if it has none."""
+
+    model_config = DESCRIBED
+
+    name: str
+    started_utc: str
+    bench: str
+    events: list[JsonEvent]
+
+
+class Quantity(BaseModel):
+    """A calibrated quantity with its standard ``uncertainty``, the root of the sum of the squared contributions.
+
+    A contribution of the ``budget`` is the uncertainty of its source times the sensitivity. ``text`` is value and
+    standard uncertainty in words, ``expanded`` the expanded uncertainty (k = 2).
+    """
+
+    value: float
+    unit: str
+    uncertainty: float
+    text: str
+    expanded: str
+    budget: list[Contribution]
+
+
+class CalibrationRow(BaseModel):
+    """A calibration that was run, with its worst ``residual`` and the ``limit`` for it.
+
+    ``id`` is the name by which a stored view refers to it. It was compared with the ``reference``. If ``valid_until``
+    is null, it is valid until a device changes.
+    """
+
+    id: str
+    name: str
+    when_utc: AwareDatetime
+    passed: bool
+    residual: float | None
+    limit: float | None
+    residual_unit: str
+    valid_until: AwareDatetime | None
+    reference: str
+    operator: str
+    software: str
+    rejections: list[str]
+    quantities: dict[str, Quantity]
+
+
+class Calibrations(BaseModel):
+    """The calibrations that were run, the newest first.
+
+    ``available`` are those that a job can run, with their titles; ``unreadable`` says which files cannot be read.
+    """
+
+    history: list[CalibrationRow]
+    available: dict[str, str]
+    unreadable: list[str]
+
+
+class Setting(BaseModel):
+    """A key of the configuration: ``value`` is in force, ``saved`` is that of the file; null if it has none.
+
+    ``editable`` says whether a page may change it. ``choices`` are its values as text if they are few, else empty.
+    """
+
+    key: str
+    value: Any
+    saved: Any
+    default: Any
+    allowed: str
+    choices: list[str]
+    unit: str
+    description: str
+    editable: bool
+
+
+class Settings(BaseModel):
+    """The keys of the configuration, and its ``file``, which pages change."""
+
+    keys: list[Setting]
+    file: str | None
+
+
+NewValue = Annotated[
+    bool | int | float | str | list[float] | None,
+    Body(embed=True, description="null clears a key that can be without a value"),
+]
 
 
 def add_records(routes: Routes, server: Server) -> None:
@@ -54,7 +135,7 @@ def add_records(routes: Routes, server: Server) -> None:
     def list_runs(page: Page) -> Response:
         """List the saved runs, the newest first."""
         names = sorted((path.parent.name for path in server.setup.runs.glob("*/run.json")), reverse=True)
-        return page.of([{"name": name} for name in names if RUN_NAME.fullmatch(name)], "name")
+        return page.of([RunName(name=name) for name in names if RUN_NAME.fullmatch(name)], lambda run: run.name)
 
     @routes.watch.get("/runs/{name}", tags=["runs"], responses={200: {"model": SavedRunBody}})
     def get_run(name: str) -> Response:
@@ -74,43 +155,11 @@ def add_records(routes: Routes, server: Server) -> None:
 
         return HTMLResponse(await long_work(lambda: run_report(load(name))))
 
-    @routes.watch.post("/runs/{name}/check", tags=["runs"])
-    async def check_run(name: str) -> RunCheck:
-        """Compute every decision of a saved run again from its images."""
-
-        def checked() -> ReplayCheck:
-            saved = load(name)
-            with saved.damage():
-                return check(saved)
-
-        found = await long_work(checked)
-        differences = [str(difference) for difference in found.differences]
-        return RunCheck(
-            views=found.views, decisions=found.decisions, is_complete=found.is_complete, differences=differences
-        )
-
     @routes.watch.get("/calibrations", tags=["bench"])
     def list_calibrations() -> Calibrations:
         """Return the calibrations in force, and those that a job can run."""
         store = CalibrationStore(server.setup.config.calibration_path(server.setup.bench))
-        history = [
-            CalibrationRow(
-                id=one.id,
-                name=one.name,
-                when_utc=one.when_utc,
-                passed=one.passed,
-                residual=one.residual,
-                limit=one.limit,
-                unit=one.residual_unit,
-                valid_until=one.valid_until,
-                reference=one.reference,
-                operator=one.operator,
-                software=one.software,
-                rejections=[str(reason) for reason in one.rejections],
-                quantities={key: _quantity(value) for key, value in one.estimates.items()},
-            )
-            for one in store.history()
-        ]
+        history = [_calibration_row(one) for one in store.history()]
         offered = {name: one.title for name, one in calibrations().items()}
         unreadable = [str(one) for one in store.unreadable]
         return Calibrations(history=history[::-1], available=offered, unreadable=unreadable)
@@ -142,8 +191,11 @@ def add_records(routes: Routes, server: Server) -> None:
         return Settings(keys=keys, file=None if file is None else str(file))
 
     @routes.operate.put("/settings/{key}", tags=["bench"])
-    def change_setting(key: Annotated[str, Field(max_length=60)], body: SettingBody) -> SettingChange:
-        """Write a key into the configuration file; it is in force when the server starts again."""
+    def change_setting(key: Annotated[str, Field(max_length=60)], value: NewValue) -> list[str]:
+        """Write a key into the configuration file; it is in force when the server starts again.
+
+        The answer has the lines of the file that were changed: removed ones with `-`, added ones with `+`.
+        """
         file = server.setup.config_file
         if file is None or not _is_for_pages(key):
             raise Forbidden(
@@ -151,21 +203,26 @@ def add_records(routes: Routes, server: Server) -> None:
                 next_step=("At a terminal of the bench's computer:", Do.SET_KEY(key=key, value="VALUE")),
             )
         try:
-            return SettingChange(changed=set_key(file, key, NONE if body.value is None else toml(body.value)))
+            return set_key(file, key, NONE if value is None else toml(value))
         except ConfigError as error:  # of this request, not of the server
             raise UsageError(error.what, next_step=error.steps, evidence=error.evidence) from error
 
 
-def _quantity(one: Estimate) -> Quantity:
-    return Quantity(
-        value=one.value,
-        unit=one.unit,
-        text=str(one),
-        uncertainty=one.uncertainty,
-        k=COVERAGE_FACTOR,
-        expanded=COVERAGE_FACTOR * one.uncertainty,
-        budget=[BudgetRow(**plain(source), contribution=source.part) for source in one.budget],
-    )
+def _calibration_row(one: CalibrationResult) -> CalibrationRow:
+    same = CalibrationRow.model_fields.keys() - {"rejections", "quantities"}
+    quantities = {
+        key: Quantity(
+            value=found.value,
+            unit=found.unit,
+            uncertainty=found.uncertainty,
+            text=str(found),
+            expanded=found.expanded,
+            budget=list(found.budget),
+        )
+        for key, found in one.estimates.items()
+    }
+    rejections = [str(reason) for reason in one.rejections]
+    return CalibrationRow(**{name: getattr(one, name) for name in same}, rejections=rejections, quantities=quantities)
 
 
 def _is_for_pages(key: str) -> bool:

@@ -1,16 +1,12 @@
 """The web application: the REST API of version 1, its events, the pages, and the numbers for Prometheus."""
 
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from typing import Any, Final
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.staticfiles import StaticFiles
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
 from starlette.exceptions import HTTPException
 
 from rig.core.errors import Problem, RigError, UsageError
@@ -68,9 +64,8 @@ def create_app(server: Server) -> FastAPI:
 
     @app.get("/metrics", include_in_schema=False)
     def metrics(_person: Watcher) -> Response:
-        registry = CollectorRegistry()
-        registry.register(_Numbers(server))
-        return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
+        text = "".join(f"{line}\n" for line in _numbers(server))
+        return Response(text, media_type="text/plain; version=0.0.4")
 
     # Every error has the same body: code, evidence and next step.
     @app.exception_handler(RigError)
@@ -91,33 +86,25 @@ def create_app(server: Server) -> FastAPI:
     return app
 
 
-# -- the numbers of the server, in the text format of Prometheus -------------------------------------------------------
+def _numbers(server: Server) -> Iterator[str]:
+    """Yield the numbers of the server as lines of the text format of Prometheus; what is not known is left out."""
+    status, numbers = server.remote.status, server.remote.call("numbers")
+    servo = status.get("servo") or {}
+    for name, kind, values in (
+        ("bench_open", "gauge", {"": bool(status.get("open"))}),
+        ("fault_latched", "gauge", {"": bool(status.get("fault"))}),
+        ("table_degrees", "gauge", {"": status.get("table_deg")}),
+        ("servo_temperature_celsius", "gauge", {"": servo.get("temperature_c")}),
+        ("servo_volts", "gauge", {"": servo.get("voltage_v")}),
+        ("event_listeners", "gauge", {"": server.hub.listeners}),
+        ("jobs", "gauge", _by_state(dict.fromkeys(JobState, 0) | numbers["jobs"])),
+        ("jobs_ended_total", "counter", _by_state(numbers["jobs_ended"])),
+        ("stops_total", "counter", {"": numbers["stops"]}),
+    ):
+        lines = [f"rig_{name}{label} {float(value)}" for label, value in values.items() if value is not None]
+        if lines:
+            yield from (f"# TYPE rig_{name} {kind}", *lines)
 
 
-class _Numbers(Collector):
-    def __init__(self, server: Server) -> None:
-        self._server = server
-
-    def collect(self) -> Iterator[Metric]:
-        server, status, numbers = self._server, self._server.remote.status, self._server.remote.call("numbers")
-        servo = status.get("servo") or {}
-        for name, text, value in (
-            ("bench_open", "Whether the bench is open.", float(bool(status.get("open")))),
-            ("fault_latched", "Whether a fault is latched.", float(bool(status.get("fault")))),
-            ("table_degrees", "Angle of the table.", status.get("table_deg")),
-            ("servo_temperature_celsius", "Temperature.", servo.get("temperature_c")),
-            ("servo_volts", "Supply voltage.", servo.get("voltage_v")),
-            ("event_listeners", "Open streams of events.", server.hub.listeners),
-        ):
-            if value is not None:
-                yield GaugeMetricFamily(f"rig_{name}", text, value)
-        jobs = GaugeMetricFamily("rig_jobs", "Jobs by state.", labels=["state"])
-        states = Counter(job["state"] for job in server.remote.call("jobs"))
-        for state in JobState:
-            jobs.add_metric([state.value], states[state])
-        yield jobs
-        ended = CounterMetricFamily("rig_jobs_ended", "Jobs ended since the server started.", labels=["state"])
-        for name, number in numbers["jobs_ended"].items():
-            ended.add_metric([name], number)
-        yield ended
-        yield CounterMetricFamily("rig_stops", "Presses of STOP since the server started.", numbers["stops"])
+def _by_state(numbers: Mapping[str, int]) -> dict[str, int]:
+    return {f'{{state="{state}"}}': number for state, number in numbers.items()}

@@ -9,7 +9,9 @@ from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from typing import Any, Final, NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
-from rig.web.answers import BenchStatus, OtherBench
+from pydantic import BaseModel
+
+from rig.web.answers import BenchStatus
 from rig.web.server import API
 
 ANSWER_S: Final = 2.0  # longer: one bench that is switched off delays the page; shorter: a busy bench looks dead
@@ -21,6 +23,22 @@ SERVICE: Final = "_hbr-rig._tcp.local."
 HOST: Final = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?")
 MAX_FOUND: Final = 50  # a device that announces many names must not fill the page
 MAX_BYTES: Final = 4_000_000  # a larger answer is none of these lists
+
+
+class OtherBench(BaseModel):
+    """A bench of the overview. ``problem`` says why its state is not known; then the rest is null.
+
+    ``job`` is the running job, ``answer`` the last answer of a recent identification, both in words; ``answered_utc``
+    is null while that job runs.
+    """
+
+    name: str
+    address: str
+    problem: str | None = None
+    status: BenchStatus | None = None
+    job: str | None = None
+    answer: str | None = None
+    answered_utc: str | None = None
 
 
 class _Place(NamedTuple):

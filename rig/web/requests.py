@@ -1,4 +1,4 @@
-"""What clients send: a model for each kind of job, and the bodies of the other requests; and what a job looks like."""
+"""The jobs that clients ask for, a model for each kind, and what a job looks like."""
 
 from enum import StrEnum
 from typing import Annotated, Literal, Self
@@ -12,10 +12,11 @@ from rig.jobs.doctor import Examined
 from rig.jobs.enroll import ViewsTakenAgain
 from rig.jobs.table import Acknowledged, TableAngle
 from rig.plans.operator import Choice
-from rig.web.access import MAX_NAME, Role
 
 
-class _Request(BaseModel):
+class RequestBody(BaseModel):
+    """A part of a request; an unknown key is a mistake."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
@@ -26,7 +27,7 @@ Fly = Annotated[
 ]
 
 
-class TrayObject(_Request):
+class TrayObject(RequestBody):
     """An object of a tray."""
 
     name: Name
@@ -44,7 +45,7 @@ class EnrollRequest(TrayObject):
     fly: Fly = None
 
 
-class RetakeRequest(_Request):
+class RetakeRequest(RequestBody):
     """Take views of an object again, which must stand as it stood; the present ones stay until all are taken."""
 
     kind: Literal["retake"] = "retake"
@@ -55,7 +56,7 @@ class RetakeRequest(_Request):
     ]
 
 
-class TrayRequest(_Request):
+class TrayRequest(RequestBody):
     """Enroll several objects one after the other. The job asks for each object, and skips those that are complete."""
 
     kind: Literal["tray"] = "tray"
@@ -64,7 +65,7 @@ class TrayRequest(_Request):
     fly: Fly = None
 
 
-class IdentifyRequest(_Request):
+class IdentifyRequest(RequestBody):
     """Identify the object on the table. ``sample`` names one object; with ``watch``, ``scan`` asks for each one."""
 
     kind: Literal["identify"] = "identify"
@@ -86,27 +87,27 @@ class IdentifyRequest(_Request):
         return self
 
 
-class EmptyTableRequest(_Request):
+class EmptyTableRequest(RequestBody):
     """Take the empty-table image."""
 
     kind: Literal["empty-table"] = "empty-table"
     anyway: bool = Field(False, description="store the image although something rotates with the table")
 
 
-class GotoRequest(_Request):
+class GotoRequest(RequestBody):
     """Rotate the table to an angle."""
 
     kind: Literal["goto"] = "goto"
     angle_deg: Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False, examples=[90.0])]
 
 
-class HomeRequest(_Request):
+class HomeRequest(RequestBody):
     """Rotate the table to its home."""
 
     kind: Literal["home"] = "home"
 
 
-class ReferenceRequest(_Request):
+class ReferenceRequest(RequestBody):
     """Set the table's angle after the operator has looked at the cable. Moves nothing."""
 
     kind: Literal["reference"] = "reference"
@@ -117,20 +118,20 @@ class ReferenceRequest(_Request):
     here: bool = Field(False, description="the present angle is home, with the cable hanging free")
 
 
-class AcknowledgeRequest(_Request):
+class AcknowledgeRequest(RequestBody):
     """Acknowledge the latched fault."""
 
     kind: Literal["acknowledge"] = "acknowledge"
     reboot: bool = Field(False, description="restart the servo first, which clears its hardware errors")
 
 
-class DoctorRequest(_Request):
+class DoctorRequest(RequestBody):
     """Check everything that the bench needs. Moves nothing."""
 
     kind: Literal["doctor"] = "doctor"
 
 
-class CameraSettings(_Request):
+class CameraSettings(RequestBody):
     """Locked settings of the camera."""
 
     exposure_us: Annotated[float | None, Field(ge=1, le=1e6)] = None
@@ -145,7 +146,7 @@ class CameraRequest(CameraSettings):
     kind: Literal["camera"] = "camera"
 
 
-class CalibrateRequest(_Request):
+class CalibrateRequest(RequestBody):
     """Run a calibration."""
 
     kind: Literal["calibrate"] = "calibrate"
@@ -170,7 +171,7 @@ JobRequest = Annotated[
 ]
 
 
-class JobQuestion(_Request):
+class JobQuestion(RequestBody):
     """What a job asks the operator. With ``takes_sample``, the answer may name the sample on the table."""
 
     text: str
@@ -179,7 +180,7 @@ class JobQuestion(_Request):
     takes_sample: bool = False
 
 
-class CalibrationRun(_Request):
+class CalibrationRun(RequestBody):
     """A calibration that a job has run, with its outcome in words."""
 
     name: str
@@ -187,7 +188,7 @@ class CalibrationRun(_Request):
     text: str
 
 
-class Calibrated(_Request):
+class Calibrated(RequestBody):
     """The result of a job ``calibrate``."""
 
     calibrations: list[CalibrationRun]
@@ -216,13 +217,12 @@ class JobState(StrEnum):
         return self in (JobState.DONE, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED)
 
 
-class StepsDone(_Request):
+class StepsDone(RequestBody):
     """Progress of a job: steps done of all steps, and the expected time left."""
 
     done: int
     total: int
     seconds_left: float | None = None
-    text: str = ""
 
 
 class Job(BaseModel):
@@ -250,68 +250,3 @@ class Job(BaseModel):
     resume: JobRequest | None = None
     run: str | None = Field(None, description="saved run of an identification, for GET /api/v1/runs/{run}")
     views: int = Field(0, description="number of pictures at GET /api/v1/jobs/{id}/views/{n}")
-
-
-# -- the bodies of the other requests ----------------------------------------------------------------------------------
-
-
-class LoginBody(_Request):
-    """A token."""
-
-    token: Annotated[str, Field(max_length=200)]
-
-
-class TokenBody(_Request):
-    """A token to be made."""
-
-    name: Annotated[str, Field(max_length=MAX_NAME, description="of the person or program that gets it")]
-    role: Role
-    days: Annotated[float | None, Field(ge=0.01, le=3650, description="how long it is valid; default: always")] = None
-
-
-class LeaseBody(_Request):
-    """How to take the lease."""
-
-    force: bool = Field(False, description="take it over from another operator, who is warned")
-
-
-class AnswerBody(_Request):
-    """The answer to the question of a job; without ``sample``, the sample on the table has no name."""
-
-    choice: Choice = Choice.CONTINUE
-    sample: Annotated[str | None, Field(max_length=1000, description="for a question with takes_sample")] = None
-
-
-class ObjectBody(_Request):
-    """Changes of an object; what is missing stays."""
-
-    name: Annotated[str | None, Field(max_length=1000)] = None
-    label: Annotated[str | None, Field(max_length=1000)] = None
-    note: Annotated[str | None, Field(max_length=10_000)] = None
-
-
-class NameBody(_Request):
-    """The name of an object."""
-
-    name: Annotated[str, Field(max_length=1000)]
-
-
-class ByHand(_Request):
-    """What hands do at a simulated bench: ``put NAME``, ``clear``, ``light 0.5`` or ``unplug`` the camera."""
-
-    words: Annotated[list[Annotated[str, Field(max_length=100)]], Field(min_length=1, max_length=4)]
-
-
-class SettingBody(_Request):
-    """A new value of a key of the configuration; null clears a key that can be without one."""
-
-    value: bool | int | float | str | list[float] | None
-
-
-class CorrectionBody(_Request):
-    """A correction of an answer; what is missing stays."""
-
-    reason: Annotated[str, Field(min_length=1, max_length=1000)]
-    object: Annotated[str | None, Field(max_length=100)] = None
-    unknown: bool = Field(False, description="the object is an unknown one")
-    sample: Annotated[str | None, Field(max_length=100)] = None

@@ -2,7 +2,6 @@
 
 import asyncio
 import hashlib
-import json
 import secrets
 import socket
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +12,7 @@ from typing import Annotated, Any, Final, TypeVar
 
 from fastapi import APIRouter, Depends, Query, Request, Response, Security
 from fastapi.security import APIKeyCookie, HTTPBearer
+from pydantic_core import to_json
 from starlette.requests import HTTPConnection
 
 from rig.catalog import Catalog
@@ -156,6 +156,7 @@ async def proposer(request: Request, person: Annotated[Person, Depends(watcher)]
 
 
 Result = TypeVar("Result")
+Row = TypeVar("Row")
 
 
 _LONG_WORK: Final = ThreadPoolExecutor(2, thread_name_prefix="long")
@@ -205,20 +206,19 @@ class PageOfList:
     limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100
     after: Annotated[str | None, Query(max_length=100)] = None
 
-    def of(self, rows: Sequence[dict[str, Any]], key: str) -> Response:
-        """Return the page with an ETag, and a link to the next one; ``key`` names the entries."""
+    def of(self, rows: Sequence[Row], key: Callable[[Row], str]) -> Response:
+        """Return the page with an ETag, and a link to the next one; ``key`` returns the name of an entry."""
         start = 0
         if self.after is not None:
-            places = [number for number, row in enumerate(rows) if row[key] == self.after]
+            places = [number for number, row in enumerate(rows) if key(row) == self.after]
             if not places:
                 raise UsageError(
                     "The list has changed: the entry after which to continue is gone.", next_step="Start again."
                 )
             start = places[0] + 1
         shown = rows[start : start + self.limit]
-        more = shown[-1][key] if start + self.limit < len(rows) else None
-        values = {"items": shown, "total": len(rows), "next": more}
-        body = json.dumps(values, ensure_ascii=False, default=str).encode()
+        more = key(shown[-1]) if start + self.limit < len(rows) else None
+        body = to_json({"items": shown, "total": len(rows), "next": more}, fallback=str)
         headers = {"Cache-Control": "private, no-cache"}
         if more is not None:
             headers["Link"] = f'<{self.request.url.include_query_params(after=more)}>; rel="next"'

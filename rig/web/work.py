@@ -14,7 +14,6 @@ from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
 from rig.catalog.copying import open_or_copy
 from rig.catalog.log import asked_by
-from rig.charts.candidates import Styles, candidates_chart
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
@@ -23,7 +22,7 @@ from rig.core.next_steps import NextSteps, as_steps
 from rig.core.plugins import plugins
 from rig.doctor.examination import open_context
 from rig.doctor.finding import Finding
-from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ranked, Started, event_dict
+from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Started, event_dict
 from rig.events.wording import next_steps, page_line
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Step, Steps
 from rig.jobs.doctor import examine
@@ -76,8 +75,6 @@ class ServedDesk(Desk):
         self._worker = worker
         self._left: TimeLeft | None = None
         self._outline: Outliner | None = None
-        self._ranked: list[Ranked] = []
-        self._styles = Styles()
 
     # -- what a job needs ---------------------------------------------------------------------------------------------
 
@@ -162,7 +159,6 @@ class ServedDesk(Desk):
             self._outline = Outliner(bench)
             left = TimeLeft(MotionTimes(bench.config), event.angles_deg, in_motion=event.in_motion)
             self._left = left if event.angles_deg else None
-            self._ranked.clear()
         if self._left is not None:
             self._left.add(event)
         if isinstance(event, Accepted):
@@ -173,9 +169,6 @@ class ServedDesk(Desk):
             if job.progress is not None:
                 left_s = None if self._left is None else self._left.seconds
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
-        if isinstance(event, Ranked):
-            self._ranked.append(event)
-            self._worker.charts[job.id] = candidates_chart(self._ranked, self._styles).svg(alone=True)
         if isinstance(event, Enrolled | Identified):
             job.result, job.result_text = event, text
         self._publish(text, next_steps(event), values)

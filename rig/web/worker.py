@@ -23,7 +23,6 @@ from rig.core.json_form import plain
 from rig.core.notify import notify_of_job
 from rig.devices.servo import ServoState
 from rig.jobs.status import bench_facts
-from rig.motion.traces import stored
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.safety.stop_channel import StopAnswer, StopListener, listen
 from rig.safety.supervisor import stopped
@@ -77,8 +76,6 @@ class BenchWorker:
         """The last known state of the bench; another one after each change."""
         self.views: dict[str, list[bytes]] = {}
         """Pictures of the last jobs as JPEG."""
-        self.charts: dict[str, str] = {}
-        """Charts of the candidates of the last jobs as SVG, after their last view."""
         self._run_job = run_job
         self._clock = clock
         self._link: Link | None = None
@@ -118,10 +115,8 @@ class BenchWorker:
         functions = {
             **{function.__name__: validate_call(function) for function in of_queue},
             "view": self._view,
-            "candidates": self._candidates,
             "picture": self._newest,
-            "numbers": lambda: {"jobs_ended": self._jobs_ended, "stops": self._stops.count()},
-            "last_move": self._last_move,
+            "numbers": self._numbers,
             "shelf": self._shelf_state,
             "thing": self._thing,
             "by_hand": self._by_hand,
@@ -143,11 +138,6 @@ class BenchWorker:
             raise JobNotFound("There is no such picture (any more).", next_step="The catalog has all enrolled views.")
         return b64encode(pictures[number]).decode()
 
-    def _candidates(self, job_id: str) -> str:
-        if job_id not in self.charts:
-            raise JobNotFound("There is no such chart (any more).", next_step="Open the report of the saved run.")
-        return self.charts[job_id]
-
     def _newest(self, after: int) -> dict[str, Any]:
         """Return the newest frame, unless its number is ``after``, and ask the camera for more."""
         self._picture.want()
@@ -155,11 +145,9 @@ class BenchWorker:
         number, content = found or (after, b"")
         return {"number": number, "age_s": self._picture.age_s, "jpeg": b64encode(content).decode()}
 
-    def _last_move(self) -> dict[str, Any]:
-        moves = stored(self._bench.state) if self._bench is not None else []
-        if not moves:
-            raise JobNotFound("The table has not moved yet.", next_step="Rotate it, then ask again.")
-        return moves[-1]
+    def _numbers(self) -> dict[str, Any]:
+        jobs = Counter(job.state.value for job in self.queue.jobs())
+        return {"jobs": jobs, "jobs_ended": self._jobs_ended, "stops": self._stops.count()}
 
     # -- the shelf of a simulated bench -------------------------------------------------------------------------------
 
@@ -222,7 +210,6 @@ class BenchWorker:
         self.views[job.id] = []
         for old in list(self.views)[:-JOBS_WITH_PICTURES]:
             del self.views[old]
-            self.charts.pop(old, None)
         state, error = JobState.FAILED, None
         try:
             if self._bench is not None:

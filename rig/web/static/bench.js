@@ -1,5 +1,5 @@
-import { $, act, get, h, listJobs, nextSteps, number, on, request, start, submit, toast, when } from "./rig.js";
-import { lineChart } from "./pictures.js";
+import { $, act, definitions, get, h, listJobs, nextSteps, number, on, request, start, submit, toast, when } from "./rig.js";
+import "./pictures.js";
 import "./shelf.js";
 
 const STATES = ["disconnected", "connected", "unreferenced", "ready", "moving", "stopped", "fault"];
@@ -80,7 +80,7 @@ on("status", (status) => {
   if (status.servo) values.push(["Servo", `${status.servo.model.replaceAll("_", "-").toUpperCase()}, ${number(status.servo.temperature_c)} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${number(status.servo.load_percent, 0)} %`]);
   if (status.camera) values.push(["Camera", `${status.camera.name}, ${status.camera.width} × ${status.camera.height}`]);
   for (const finding of status.findings || []) values.push(["Note", finding]);
-  $("values").replaceChildren(...values.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  $("values").replaceChildren(...definitions(values));
   $("set-angle").hidden = !status.doubt;
   $("doubt").textContent = status.doubt ? `The table's angle is in doubt: ${status.doubt}.` : "";
   showLocks(status.locks || {});
@@ -90,14 +90,13 @@ on("plan", (event) => {
   if (event.event === "moved") gyro = event.rotation_imu_deg === null ? null : event.encoder_deg - event.rotation_encoder_deg + event.rotation_imu_deg;
 });
 
-// -- jobs, the check of the bench, the last move ---------------------------------------------------------------------------
+// -- jobs, the check of the bench ------------------------------------------------------------------------------------------
 
 let lastEnded = "";
 listJobs((job) => {
   if (job.request.kind === "doctor" && job.result) findings(job.result.findings, job.ended_utc || job.started_utc);
   if (job.ended_utc && job.ended_utc !== lastEnded) {
     lastEnded = job.ended_utc;
-    showMove();
     showTour();
   }
 });
@@ -114,17 +113,6 @@ function findings(list, utc) {
   $("findings").replaceChildren(...open.map(row), fine.length > 0 && h("li", { style: "display: block" }, h("details", {}, h("summary", {}, `${fine.length} fine`), h("ul", { class: "findings" }, ...fine.map(row)))));
 }
 
-async function showMove() {
-  const move = await get("/moves/last").catch(() => null);
-  $("move-section").hidden = !move?.time_s?.length;
-  if (!move?.time_s?.length) return;
-  const points = (values) => move.time_s.map((time, k) => [time, values[k]]);
-  $("move").replaceChildren(
-    lineChart([{ name: "table", colour: "c0", points: points(move.encoder_deg) }, { name: "planned", colour: "c1", dashed: true, points: points(move.profile_deg) }], { label: "Angle of the table during the last move", unit: "°" }),
-    h("p", { class: "small soft" }, `From ${number(move.from_deg, 1)}° to ${number(move.to_deg, 1)}°, ${move.settled_s === null ? "not finished" : `at rest after ${move.settled_s.toFixed(2)} s`}. Largest load ${number(Math.max(...move.load_percent.map(Math.abs)), 0)} %.`),
-  );
-}
-
 // -- the camera: meters of the live image, and its locked settings -----------------------------------------------------------
 
 const SIDE = 240; // pixels of the measured image: fine enough for a meter
@@ -132,7 +120,7 @@ const canvas = document.createElement("canvas");
 const context = canvas.getContext("2d", { willReadFrequently: true });
 let sharpest = 1;
 
-/** Measure the live image: the shares of its levels, and the variance of its Laplacian; mark its sharp edges. */
+/** Measure the live image: the shares of its levels, and the variance of its Laplacian. */
 function measure() {
   const image = $("live-image");
   if (!$("camera").open || !image.naturalWidth) return;
@@ -147,13 +135,11 @@ function measure() {
     levels[Math.min(63, grey[k] >> 2)] += 1;
   }
   let [sum, squares, count] = [0, 0, 0];
-  const edges = [];
   for (let y = 1; y < height - 1; y += 1) {
     for (let x = 1; x < width - 1; x += 1) {
       const k = y * width + x;
       const value = 4 * grey[k] - grey[k - 1] - grey[k + 1] - grey[k - width] - grey[k + width];
       [sum, squares, count] = [sum + value, squares + value * value, count + 1];
-      if (Math.abs(value) > 60) edges.push([x, y]);
     }
   }
   const sharpness = squares / count - (sum / count) ** 2;
@@ -164,12 +150,8 @@ function measure() {
   const tall = (level) => Math.min(58, 58 * Math.sqrt(level / most));
   const bars = levels.map((level, k) => h("rect", { x: k * 4, y: 60 - tall(level), width: 3.4, height: tall(level), fill: "currentColor", class: k === 63 && level > 20 ? "limit" : "none" }));
   $("histogram").replaceChildren(h("svg", { viewBox: "0 0 256 60", class: "chart", style: "height: 4rem", preserveAspectRatio: "none", role: "img", "aria-label": "Levels of the image, dark at the left" }, ...bars));
-  const scale = image.naturalWidth / width;
-  const marks = $("peaking").checked ? edges.map(([x, y]) => h("rect", { x: x * scale, y: y * scale, width: scale, height: scale, fill: "#3df26b" })) : [];
-  $("outline").replaceChildren(...marks);
 }
 setInterval(measure, 400);
-$("peaking").addEventListener("change", measure);
 
 const LOCKS = [["exposure_us", "Exposure time, µs"], ["gain", "Gain"], ["white_balance_k", "White balance, K"], ["focus", "Focus"]];
 let locksShown = "";
@@ -218,5 +200,5 @@ async function showTour() {
 }
 $("tour-close").addEventListener("click", () => { localStorage.setItem("rig-tour", "hidden"); $("tour").hidden = true; });
 document.addEventListener("changed", (event) => { shelf = event.detail; act(showTour); });
-on("hello", () => act(async () => { await showTour(); await showMove(); }));
+on("hello", () => act(showTour));
 start();

@@ -1,28 +1,17 @@
 // The overview of several benches; the server asks them.
-import { $, act, h, on, request, start, stateWords, when } from "./rig.js";
+import { $, act, get, h, on, start, stateWords, update, when } from "./rig.js";
 
 const EVERY_MS = 3000;
-const cards = new Map(); // they stay, so that a link keeps the focus
 
-function card({ name, address }) {
-  const parts = { state: h("p"), job: h("p"), answer: h("p") };
-  $("benches").append(h("section", {}, h("h2", {}, h("a", { href: address }, name)), parts.state, parts.job, parts.answer));
-  return parts;
+function card({ name, address, problem, status, job, answer, answered_utc: answered }) {
+  const [words, kind, why] = problem ? [`This bench ${problem}.`, "bad"] : stateWords(status);
+  return h("section", {}, h("h2", {}, h("a", { href: address }, name)),
+    h("p", { class: kind === "bad" ? "error" : "" }, why || words),
+    job && h("p", {}, `Job: ${job}`),
+    answer && h("p", {}, `Last answer: ${answer}${answered ? ` (${when(answered)})` : ""}`));
 }
 
-async function load() {
-  for (const one of (await request("GET", "/benches")).items) {
-    if (!cards.has(one.name)) cards.set(one.name, card(one));
-    const { state, job, answer } = cards.get(one.name);
-    const [words, kind, why] = one.problem ? [`This bench ${one.problem}.`, "bad"] : stateWords(one.status);
-    const time = one.answered_utc ? ` (${when(one.answered_utc)})` : "";
-    state.className = kind === "bad" ? "error" : "";
-    state.textContent = why || words;
-    job.textContent = one.job ? `Job: ${one.job}` : "";
-    answer.textContent = one.answer ? `Last answer: ${one.answer}${time}` : "";
-  }
-}
-
+const load = async () => update($("benches"), ...(await get("/benches")).items.map(card));
 on("hello", () => act(load));
 setInterval(() => { if (!document.hidden) act(load); }, EVERY_MS);
 start();

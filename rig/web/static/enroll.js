@@ -1,5 +1,5 @@
-import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table, valuesOf } from "./rig.js";
-import { comparisons, pathDrawing } from "./pictures.js";
+import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table, update, valuesOf } from "./rig.js";
+import { comparisons } from "./pictures.js";
 import "./shelf.js";
 
 // -- one object: a name that is known already is a choice ------------------------------------------------------------------
@@ -108,7 +108,6 @@ $("tray").addEventListener("submit", (event) => {
 
 let job = null;
 let views = [];
-let azimuths = [];
 let name = "";
 let similar = null;
 let rejected = 0;
@@ -121,13 +120,12 @@ function say(words, kind, ...detail) {
 
 function take(event) {
   switch (event.event) {
-    case "started": [views, azimuths, similar, rejected, name] = [[], [], null, 0, event.name || name]; break;
+    case "started": [views, similar, rejected, name] = [[], null, 0, event.name || name]; break;
     case "item":
       states[event.name] = event.reason ? "skipped" : "now";
       break;
     case "accepted":
-      views.push({ number: event.picture, place: event.index, words: `${event.azimuth_deg.toFixed(0)}°` });
-      azimuths.push(event.azimuth_deg);
+      views.push({ number: event.picture, words: `${event.azimuth_deg.toFixed(0)}°` });
       break;
     case "rejected": rejected += 1; break;
     case "similar_objects": similar = event; break;
@@ -136,30 +134,11 @@ function take(event) {
   }
 }
 
-let drawn = 0;
-/** Add the pictures that came; a page that is opened in the middle shows all so far. */
+/** Show the pictures so far; those that are there already stay. */
 function showViews() {
-  if (views.length < drawn || !views.length) {
-    $("thumbs").replaceChildren();
-    drawn = 0;
-  }
-  for (const view of views.slice(drawn)) $("thumbs").append(h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), view.words));
-  drawn = views.length;
+  update($("thumbs"), ...views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), view.words)));
   $("views-section").hidden = !views.length;
   $("views-title").textContent = `${counted(views.length, "view")}${rejected ? `, ${rejected} taken again` : ""}`;
-  $("way").hidden = !azimuths.length || isEnded(job);
-  if (azimuths.length) $("way").replaceChildren(progressRing(azimuths));
-}
-
-/** Return a ring with a dot for each view that is stored. */
-function progressRing(degrees) {
-  const drawing = pathDrawing([]);
-  drawing.setAttribute("aria-label", `${degrees.length} views around the object`);
-  for (const azimuth of degrees) {
-    const angle = (azimuth * Math.PI) / 180;
-    drawing.append(h("circle", { cx: 100 - 82 * Math.sin(angle), cy: 100 - 82 * Math.cos(angle), r: 5, class: "dot c0" }));
-  }
-  return drawing;
 }
 
 let compared = "";
@@ -180,7 +159,7 @@ async function showSimilar() {
 followJob(["enroll", "tray"], {
   begin(next) {
     job = next;
-    [views, azimuths, similar, rejected, states] = [[], [], null, 0, {}];
+    [views, similar, rejected, states] = [[], null, 0, {}];
     name = job.request.name || "";
     if (job.request.kind === "tray" && !isEnded(job)) objects = job.request.objects.map((one) => ({ ...one }));
   },

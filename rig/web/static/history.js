@@ -1,12 +1,10 @@
-import { $, API, act, ask, at, canOperate, counted, dayOf, get, h, on, pager, percent, personOf, request, start, table, toast, when } from "./rig.js";
-import { columnChart, lineChart, picture } from "./pictures.js";
+import { $, API, act, ask, at, canOperate, counted, get, h, on, pager, percent, personOf, request, start, table, toast, when } from "./rig.js";
+import { picture } from "./pictures.js";
 
-const DAYS = 14; // columns of the chart: more are too narrow for their numbers
 const RUN_S = 1800; // a search that takes longer than this has no report here
 
 let rows = [];
 let runs = [];
-let emptyTable = null; // when the last empty-table image was taken
 const wanted = new URLSearchParams(location.search).get("result");
 let opened = false;
 
@@ -41,20 +39,6 @@ function render() {
   if (!rows.length) $("answers").replaceChildren(h("tbody", {}, h("tr", {}, h("td", { class: "empty" }, "There is no answer yet. ", h("a", { href: "/identify" }, "Identify an object")))));
 }
 
-function charts() {
-  const days = new Map();
-  for (const one of rows) {
-    const count = days.get(day(one)) || [0, 0];
-    days.set(day(one), [count[0] + 1, count[1] + (one.outcome === "found" ? 0 : 1)]);
-  }
-  const last = Array.from({ length: DAYS }, (_, k) => new Date(Date.now() - 86400000 * (DAYS - 1 - k)));
-  const shown = last.map((one) => [one.toLocaleDateString(undefined, { day: "numeric", month: "numeric" }), ...(days.get(dateOf(one)) || [0, 0])]);
-  $("days").replaceChildren(columnChart(shown, `Answers a day: ${shown.map(([date, all, other]) => `${date} ${all}, of them ${other} not found`).join("; ")}`));
-  const scored = rows.filter((one) => one.outcome === "found" && one.score !== null && (!emptyTable || one.time_utc >= emptyTable)).reverse();
-  $("drift").replaceChildren(lineChart([{ name: "score", colour: "c0", points: scored.map((one, k) => [k, one.score]) }], { label: "Score of the found objects, in order", zero: true }));
-  $("drift-words").textContent = `Score of each found object${emptyTable ? ` since the empty-table image of ${when(emptyTable)}` : ""}. If it falls slowly, take the empty-table image again.`;
-}
-
 // -- one answer -----------------------------------------------------------------------------------------------------------
 
 /** Return the saved run of an answer: the last one that began before it. Its name has the time of its beginning. */
@@ -70,13 +54,7 @@ async function open(one) {
     one.image ? picture(`${API}/results/${one.id}/image?full=true`, "The first view", "First view") : h("p", { class: "soft" }, "No image was recorded."),
     one.object ? picture(`${API}/pose-picture?object=${at(one.object)}`, `${one.object} as enrolled`, one.object, " as enrolled") : h("span"));
   const facts = h("p", { class: "small soft" }, [when(one.time_utc), personOf(one.operator), counted(one.views, "view"), one.sample && `sample ${one.sample}`, one.correction_reason && `corrected by ${one.corrected_by}: ${one.correction_reason}`].filter(Boolean).join(", "));
-  const checked = h("p", { class: "small", id: "checked", role: "status" });
-  const check = async () => {
-    checked.textContent = "Computing again …";
-    const done = await request("POST", `/runs/${run}/check`);
-    checked.textContent = done.differences.length ? `${counted(done.differences.length, "difference")}: ${done.differences.slice(0, 3).join("; ")}` : `Computed again: ${counted(done.views, "descriptor")} and ${counted(done.decisions, "decision")}. All are as saved.`;
-  };
-  const links = run ? [h("div", { class: "row" }, h("a", { class: "button", href: `${API}/runs/${run}/report`, target: "_blank" }, "Open the report"), h("button", { class: "quiet", onclick: () => act(check) }, "Compute again")), checked] : [];
+  const links = run ? [h("a", { class: "button", href: `${API}/runs/${run}/report`, target: "_blank" }, "Open the report")] : [];
   const choice = await ask(`Answer ${one.id}: ${words(one)}`, [pictures, facts, ...links], canOperate() ? [["correct", "Correct it", "quiet"]] : []);
   if (choice === "correct") await correct(one);
 }
@@ -109,11 +87,9 @@ for (const id of ["search", "outcome", "since", "until"]) $(id).addEventListener
 const load = pager(() => "/results?limit=500", ({ items }, isFirst) => {
   rows = isFirst ? items : [...rows, ...items];
   render();
-  charts();
 });
 on("hello", () => act(async () => {
   runs = (await get("/runs?limit=500")).items.map((run) => run.name);
-  emptyTable = (await get("/log?limit=500")).items.find((entry) => entry.action === "photographed the empty table")?.time_utc ?? null;
   await load();
   const one = rows.find((row) => row.id === wanted);
   if (one && !opened) {

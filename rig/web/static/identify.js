@@ -1,4 +1,4 @@
-import { $, API, act, at, counted, either, followJob, get, h, isEnded, nextSteps, on, percent, remembered, showJob, start, when } from "./rig.js";
+import { $, API, act, at, counted, either, followJob, get, h, isEnded, nextSteps, on, percent, showJob, start, update, when } from "./rig.js";
 import { pathDrawing, picture, posePicture, viewPicture } from "./pictures.js";
 import "./shelf.js";
 
@@ -19,22 +19,6 @@ function chooseMode() {
 }
 for (const radio of $("start").elements.watch) radio.addEventListener("change", chooseMode);
 chooseMode(); // a browser that reloads the page can keep the choice
-remembered($("sound"), "rig-sound");
-
-/** Play a short tone: a rising one for a found object, a falling one for anything else. */
-function play(found) {
-  if (!$("sound").checked) return;
-  navigator.vibrate?.(found ? 80 : [80, 80, 80]);
-  const audio = new AudioContext();
-  [found ? 660 : 440, found ? 880 : 330].forEach((hertz, k) => {
-    const [tone, volume] = [audio.createOscillator(), audio.createGain()];
-    tone.frequency.value = hertz;
-    volume.gain.value = 0.15;
-    tone.connect(volume).connect(audio.destination);
-    tone.start(audio.currentTime + 0.16 * k);
-    tone.stop(audio.currentTime + 0.16 * k + 0.14);
-  });
-}
 
 // -- the search, as its events tell it ------------------------------------------------------------------------------------
 
@@ -102,7 +86,6 @@ function take(event, job) {
 
 function keep(answer, job) {
   shown = { ...answer, job: job.id, watch: job.request.watch, time: ready ? new Date().toISOString() : job.ended_utc || job.started_utc };
-  if (ready) play(shown.outcome === "found");
 }
 
 // -- what is shown --------------------------------------------------------------------------------------------------------
@@ -116,13 +99,6 @@ function headline(words, kind, ...detail) {
 }
 
 const enrolledPicture = (one, words) => picture(posePicture(one.name, one.pose_deg), `${one.name} as enrolled, from the same side`, h("strong", {}, one.name), words);
-
-/** Show pictures, unless they are there already: the page is drawn again after each event. */
-function setPictures(box, key, make) {
-  if (box.dataset.key === key) return;
-  box.dataset.key = key;
-  box.replaceChildren(...make());
-}
 
 /**
  * Show where two objects differ most. Without a second one it is the enrolled object that looks most like the first,
@@ -167,10 +143,9 @@ function showAnswer(answer) {
       after = [h("a", { class: "button", href: "/enroll" }, "Enroll it")];
     }
   }
-  const key = `${answer.job} ${answer.time} ${outcome} ${answer.name}`;
-  setPictures($("enrolled"), key, () => pictures.map(([one, words]) => enrolledPicture(one, words)));
+  update($("enrolled"), ...pictures.map(([one, words]) => enrolledPicture(one, words)));
   $("enrolled").hidden = !pictures.length;
-  setPictures($("after"), key, () => after);
+  update($("after"), ...after);
   const [one, other] = outcome === "ambiguous" ? answer.possible : [outcome === "found" ? answer.name : ""];
   compare(one, other);
 }
@@ -186,14 +161,9 @@ function showSearch() {
   $("candidates").replaceChildren(...rows);
   $("way").replaceChildren(pathDrawing(s.azimuths.slice(-9)));
   $("steps").replaceChildren(...s.steps.slice(-12).map((step) => h("li", { class: step.soft ? "soft" : "" }, step.words)));
+  update($("thumbs"), ...s.views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), view.words)));
   $("notes").replaceChildren(...s.notes.map((words) => h("li", {}, words)));
   $("search").hidden = !s.views.length;
-}
-
-function showThumbs(job, views) {
-  const key = `${job} ${views.length}`;
-  setPictures($("thumbs"), key, () => views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job}/views/${view.number}`, alt: "", loading: "lazy" }), view.words)));
-  if (views.length && search.candidates.length) setPictures($("chart"), key, () => [h("img", { src: `${API}/jobs/${job}/candidates?views=${views.length}`, alt: "The candidates after each view", loading: "lazy", style: "width: 100%" })]);
 }
 
 /** Show the last recorded answers; each leads to its place in the history. */
@@ -222,7 +192,6 @@ function redraw() {
   }
   if (shown && job.request.watch && !idle) $("answer-detail").append(h("p", {}, h("strong", {}, search !== shown.search && search.views.length ? "Searching the next object …" : search.live)));
   showSearch();
-  showThumbs(job.id, search.views);
 }
 
 followJob(["identify"], {

@@ -1,12 +1,8 @@
-import { $, API, act, ask, at, canOperate, counted, dayOf, followJob, get, h, isEnded, on, request, showJob, start, submit, toast, when } from "./rig.js";
-import { comparisons, lineChart } from "./pictures.js";
+import { $, API, act, ask, at, canOperate, counted, dayOf, definitions, followJob, get, h, isEnded, on, request, showJob, start, submit, toast, when } from "./rig.js";
+import { comparisons } from "./pictures.js";
 
 let one = null;
 const wanted = () => new URLSearchParams(location.search).get("name") || "";
-
-function values(box, rows) {
-  box.replaceChildren(...rows.filter(([, value]) => value).flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
-}
 
 // -- the views -------------------------------------------------------------------------------------------------------------
 
@@ -14,14 +10,14 @@ let silhouettes = {};
 
 async function showView(view) {
   const e = view.evidence;
-  values($("view"), [
+  $("view").replaceChildren(...definitions([
     ["View", `${view.index + 1} of ${one.views_taken.length}`],
     ["Taken", view.captured_utc && when(view.captured_utc)],
     ["Sharpness", e.sharpness?.toFixed(0)],
     ["Brightness", e.mean_level === undefined ? null : `${e.mean_level.toFixed(0)} of 255`],
     ["Too bright", e.saturated_share === undefined ? null : `${(100 * e.saturated_share).toFixed(1)} %`],
     ["Exposure", e.locks?.exposure_us && `${(e.locks.exposure_us / 1000).toFixed(1)} ms`],
-  ]);
+  ]));
   // of an import, no bench knows where it stood; of views in motion, the table stands at none of their angles
   $("retake").disabled = !canOperate() || !view.captured_utc || Boolean(view.evidence.motion);
   if (!$("outline-on").checked) return;
@@ -43,13 +39,13 @@ async function load() {
   document.title = `${one.name} – ${document.title.split(" – ").at(-1)}`;
   $("object-label").textContent = one.label;
   silhouettes = {};
-  values($("about"), [
+  $("about").replaceChildren(...definitions([
     ["Views", one.unfinished_views === null ? String(one.views) : `${one.unfinished_views}, interrupted`],
     ["Label", one.label],
     ["Note", one.note],
     ["First enrolled", dayOf(one.created_utc)],
     ["Looks the same", one.similar?.period_deg === 0 ? "from all sides" : one.similar?.period_deg && one.similar.period_deg < 360 ? `every ${one.similar.period_deg}°` : null],
-  ]);
+  ]));
   $("again").href = `/enroll?name=${at(one.name)}`;
   $("again").textContent = one.unfinished_views === null ? "Enroll again" : "Continue the enrollment";
   $("object-export").href = `${API}/export?name=${at(one.name)}`;
@@ -61,9 +57,6 @@ async function load() {
   }));
   $("viewer").hidden = !one.views_taken.length;
   if (one.views_taken.length) $("viewer").show(one.name, one.views_taken);
-  const measured = one.views_taken.filter((view) => view.evidence.sharpness !== undefined);
-  const line = (name, key, colour) => ({ name, colour, points: measured.map((view) => [view.azimuth_deg, view.evidence[key]]).sort((a, b) => a[0] - b[0]) });
-  $("meters").replaceChildren(...(measured.length > 1 ? [h("h3", { class: "wide" }, "Sharpness and brightness around the object"), lineChart([line("sharpness", "sharpness", "c0"), line("brightness", "mean_level", "c1")], { label: "Sharpness and brightness of the views by angle", zero: true, high: 190 })] : []));
   act(showSimilar);
 }
 

@@ -1,5 +1,5 @@
-// Pictures and charts: the live image, an object that turns, pairs of pictures, the path of a search, lines and columns.
-import { API, at, duration, get, h, number, on } from "./rig.js";
+// Pictures: the live image, an object that turns, pairs of pictures, the path of a search.
+import { API, at, duration, get, h, on } from "./rig.js";
 
 export const viewPicture = (id) => `${API}/views/${id}/picture`;
 export const posePicture = (name, azimuthDeg = 0) => `${API}/pose-picture?object=${at(name)}&azimuth_deg=${azimuthDeg.toFixed(1)}`;
@@ -130,7 +130,7 @@ class RigViewer extends HTMLElement {
 }
 customElements.define("rig-viewer", RigViewer);
 
-// -- charts --------------------------------------------------------------------------------------------------------------
+// -- the path of a search --------------------------------------------------------------------------------------------------------------
 
 const point = (radius, degrees) => {
   const angle = (degrees * Math.PI) / 180;
@@ -155,41 +155,4 @@ export function pathDrawing(azimuths) {
   });
   const label = azimuths.length ? `The camera's way around the object: ${azimuths.map((one) => `${one.toFixed(0)}°`).join(", ")}` : "No view yet";
   return h("svg", { viewBox: "0 0 200 200", class: "chart", role: "img", "aria-label": label }, ...parts);
-}
-
-/** Return a chart of lines: `series` have a name, a class for the colour, and points [x, y]; y may be null. */
-export function lineChart(series, { label, unit = "", high = 150, zero = false }) {
-  const all = series.flatMap((one) => one.points).filter(([, y]) => y !== null && y !== undefined);
-  if (!all.length) return h("p", { class: "soft" }, "Nothing to show yet.");
-  const [xs, ys] = [all.map(([x]) => x), all.map(([, y]) => y)];
-  let [low, top] = [Math.min(...ys, ...(zero ? [0] : [])), Math.max(...ys, ...(zero ? [0] : []))];
-  if (top - low < 1e-9) [low, top] = [low - 1, top + 1];
-  const [x0, x1] = [Math.min(...xs), Math.max(...xs)];
-  const X = (x) => 48 + (460 * (x - x0)) / (x1 - x0 || 1);
-  const Y = (y) => 12 + ((high - 30) * (top - y)) / (top - low);
-  const parts = [low, top].flatMap((y) => [h("line", { x1: 48, x2: 508, y1: Y(y), y2: Y(y), class: "grid" }), h("text", { x: 42, y: Y(y) + 4, "text-anchor": "end", class: "axis" }, `${number(y, Math.max(0, Math.ceil(1 - Math.log10(top - low))))}${unit}`)]);
-  for (const one of series) {
-    let pen = "M";
-    const d = one.points.map(([x, y]) => { if (y === null || y === undefined) { pen = "M"; return ""; } const text = `${pen}${X(x).toFixed(1)} ${Y(y).toFixed(1)}`; pen = "L"; return text; }).join("");
-    parts.push(h("path", { d, class: `curve ${one.colour}${one.dashed ? " dashed" : ""}` }));
-  }
-  const key = h("p", { class: "small" }, ...series.flatMap((one) => [h("span", { class: one.colour }, "━ "), `${one.name}   `]));
-  return h("div", {}, h("svg", { viewBox: `0 0 520 ${high}`, class: "chart", role: "img", "aria-label": label }, ...parts), series.length > 1 && key);
-}
-
-/** Return a chart of columns: rows of [label, value, share], the share of the value in another colour. */
-export function columnChart(rows, label) {
-  const most = Math.max(1, ...rows.map(([, value]) => value));
-  const width = 480 / Math.max(rows.length, 7);
-  const every = Math.ceil(rows.length / 7); // names of more columns would touch each other
-  const parts = rows.flatMap(([name, value, share], k) => {
-    const [x, tall] = [20 + k * width, (90 * value) / most];
-    return [
-      h("rect", { x, y: 104 - tall, width: width * 0.7, height: tall, rx: 3, fill: "currentColor", class: "c0" }),
-      share > 0 && h("rect", { x, y: 104 - (90 * share) / most, width: width * 0.7, height: (90 * share) / most, rx: 3, fill: "currentColor", class: "c1" }),
-      h("text", { x: x + width * 0.35, y: 98 - tall, "text-anchor": "middle", class: "small" }, value ? String(value) : ""),
-      h("text", { x: x + width * 0.35, y: 120, "text-anchor": "middle", class: "axis" }, (rows.length - 1 - k) % every ? "" : name),
-    ].filter(Boolean);
-  });
-  return h("svg", { viewBox: "0 -8 520 134", class: "chart", role: "img", "aria-label": label }, ...parts);
 }

@@ -1,5 +1,5 @@
 // Calibrations, log, settings and tokens: each part runs on the page that has its element.
-import { $, act, ask, at, canOperate, counted, dayOf, followJob, get, h, number, on, pager, personOf, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
+import { $, act, ask, at, canOperate, counted, dayOf, definitions, followJob, get, h, number, on, pager, personOf, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
 
 // -- calibrations -----------------------------------------------------------------------------------------------------------
 
@@ -7,7 +7,7 @@ import { $, act, ask, at, canOperate, counted, dayOf, followJob, get, h, number,
 function residual(one) {
   if (one.residual === null || one.limit === null) return null;
   const share = Math.min(one.residual / one.limit, 1);
-  return h("div", {}, h("progress", { max: 1, value: share, "aria-label": "residual, as a share of its limit" }), h("span", { class: "small soft" }, `residual ${Number(one.residual.toPrecision(2))} of at most ${Number(one.limit.toPrecision(2))} ${one.unit}`));
+  return h("div", {}, h("progress", { max: 1, value: share, "aria-label": "residual, as a share of its limit" }), h("span", { class: "small soft" }, `residual ${Number(one.residual.toPrecision(2))} of at most ${Number(one.limit.toPrecision(2))} ${one.residual_unit}`));
 }
 
 /** Return when a result ends, in words. */
@@ -21,14 +21,17 @@ function validity(one) {
 function traceability(one) {
   const facts = [["reference", one.reference], ["operator", one.operator], ["software", one.software], ["valid until", one.valid_until ? dayOf(one.valid_until) : "a device changes"]];
   const short = (value, unit = "") => `${Number(value.toPrecision(2))} ${unit}`.trim();
-  const rows = Object.entries(one.quantities).flatMap(([name, of]) => of.budget.map((source, i) => [
-    i ? "" : `${name.replaceAll("_", " ")}: ${of.text}; U = ${short(of.expanded, of.unit)}`,
-    source.source, source.kind, short(source.uncertainty, source.unit), short(source.sensitivity), short(source.contribution), `${of.uncertainty ? Math.round(100 * (source.contribution / of.uncertainty) ** 2) : 0} %`,
-  ]));
+  const rows = Object.entries(one.quantities).flatMap(([name, of]) => of.budget.map((source, i) => {
+    const contribution = Math.abs(source.sensitivity) * source.uncertainty;
+    return [
+      i ? "" : `${name.replaceAll("_", " ")}: ${of.text}; U = ${of.expanded}`,
+      source.source, source.kind, short(source.uncertainty, source.unit), short(source.sensitivity), short(contribution), `${of.uncertainty ? Math.round(100 * (contribution / of.uncertainty) ** 2) : 0} %`,
+    ];
+  }));
   const budget = h("table", { class: "small" });
   table(budget, ["Quantity; U with k = 2", "Source of uncertainty", "Type", "u of the source", "Sensitivity", "Contribution", "Share"], rows);
   return h("details", {}, h("summary", {}, "Uncertainty and reference"),
-    h("dl", { class: "values small" }, ...facts.flatMap(([name, words]) => [h("dt", {}, name), h("dd", {}, words)])),
+    h("dl", { class: "values small" }, ...definitions(facts)),
     h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Uncertainty budget of ${one.name}` }, budget));
 }
 
@@ -40,7 +43,7 @@ if ($("calibrations")) {
       const results = newest.map((one) => h("div", {},
         h("p", {}, h("span", { class: `tag ${one.passed ? "good" : "bad"}` }, one.passed ? "passed" : "not passed"), ` ${when(one.when_utc)}`, validity(one) && h("span", { class: "soft small" }, `, ${validity(one)}`)),
         residual(one),
-        h("dl", { class: "values small" }, ...Object.entries(one.quantities).slice(0, 4).flatMap(([key, of]) => [h("dt", {}, key.replaceAll("_", " ")), h("dd", {}, of.text)])),
+        h("dl", { class: "values small" }, ...definitions(Object.entries(one.quantities).slice(0, 4).map(([key, of]) => [key.replaceAll("_", " "), of.text]))),
         Object.keys(one.quantities).length ? traceability(one) : null,
         ...one.rejections.map((words) => h("p", { class: "error small" }, words))));
       return h("li", { class: "card" }, h("h2", {}, title), ...(results.length ? results : [h("p", { class: "soft" }, "Never done on this bench.")]), h("button", { class: results.length ? "quiet" : "", onclick: () => submit({ kind: "calibrate", name }) }, results.length ? "Run again" : "Run"));

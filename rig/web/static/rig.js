@@ -588,17 +588,14 @@ export function pager(path, add) {
   return () => load(false);
 }
 
+/** Return the terms and the descriptions of a list of definitions; without those that have no value. */
+export const definitions = (rows) => rows.filter(([, value]) => value).flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]);
+
 export function table(element, head, rows) {
   element.replaceChildren(
     h("thead", {}, h("tr", {}, ...head.map((text) => (text ? h("th", { scope: "col" }, text) : h("td", {}))))),
     h("tbody", {}, ...rows.map((row) => h("tr", {}, ...row.map((cell) => h("td", {}, cell instanceof Node ? cell : String(cell ?? "")))))),
   );
-}
-
-/** Keep a choice of this browser: a check box, and whether it is ticked. */
-export function remembered(box, key) {
-  box.checked = localStorage.getItem(key) === "1";
-  box.addEventListener("change", () => localStorage.setItem(key, box.checked ? "1" : ""));
 }
 
 export async function start() {

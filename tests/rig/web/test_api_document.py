@@ -16,7 +16,9 @@ from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import error_kinds
 from rig.events.events import Event, event_dict, event_of
-from rig.web.answers import ListedResult, LogRow, Move, ServoReading, Status
+from rig.web.answers import ServoReading
+from rig.web.api_bench import Status
+from rig.web.api_catalog import ListedResult, LogRow
 from rig.web.app import create_app
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup
@@ -46,7 +48,7 @@ def test_committed_document_is_that_of_the_program(served, document):
 
 def test_each_operation_has_a_plain_name_a_schema_for_its_answer_and_the_right_that_it_needs(document):
     operations = [one for methods in document["paths"].values() for one in methods.values()]
-    assert len({one["operationId"] for one in operations}) == len(operations) == 54
+    assert len({one["operationId"] for one in operations}) == len(operations) == 52
     for one in operations:
         (answer,) = (found for status, found in one["responses"].items() if status.startswith("2"))
         assert all(content["schema"] for content in answer["content"].values()), one["operationId"]
@@ -130,7 +132,6 @@ def test_stream_saved_run_and_lists_have_the_fields_of_the_document(serve):
     status = get("/api/v1/status").json()
     assert status.keys() == Status.model_fields.keys()
     assert (status["open"], status["servo"].keys()) == (True, ServoReading.model_fields.keys())
-    assert get("/api/v1/moves/last").json().keys() == Move.model_fields.keys()
     for path, row in (("results", ListedResult), ("log", LogRow)):
         found = get(f"/api/v1/{path}").json()["items"]
         assert [row.model_validate(one).model_dump(mode="json") for one in found] == found != []

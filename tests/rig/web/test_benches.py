@@ -12,8 +12,7 @@ import pytest
 from rig.config import load_config
 from rig.core.errors import ConfigError
 from rig.web.access import Role
-from rig.web.answers import OtherBench
-from rig.web.benches import SERVICE, BenchesInNetwork, OtherBenches
+from rig.web.benches import SERVICE, BenchesInNetwork, OtherBench, OtherBenches
 from tests.rig.web.conftest import Served, over_http, starting
 
 SECRET = "rig_never-stored"

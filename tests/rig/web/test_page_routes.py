@@ -121,7 +121,7 @@ def test_settings_are_written_to_the_file_and_only_harmless_ones(serve, tmp_path
     assert put("identify.max_views", 5).status_code == 403  # this server has no file
     file = tmp_path / "rig.toml"
     served.server.setup = served.server.setup.model_copy(update={"config_file": file})
-    assert put("identify.max_views", 5).json()["changed"]
+    assert put("identify.max_views", 5).json() == ["+ [identify]", "+ max_views = 5"]
     assert put("identify.max_views", 900).status_code == 422
     assert put("identify.strategy", None).status_code == 200
     assert put("servo.port", "/dev/null").status_code == 403
