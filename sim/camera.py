@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hbr.drawing.bench import Visit
 from hbr.drawing.noise import Noise
 from rig.devices import v4l2
+from rig.devices.camera import Capture
 from sim.calibration_board import BoardOnPlatter
 from sim.camera_controls import BUFFERS_RANGE, EXPOSURE_RANGE, KELVIN_RANGE, NOMINAL_EXPOSURE, SHARP_AT, Controls
 from sim.frame_times import FPS, FrameTimes, bands, frame_after, row_weights, start_ns
@@ -50,7 +51,7 @@ _STILL_PX = 0.25
 _MAX_SUBFRAMES = 16  # more: smoother smear of fast motion, at one drawn image each
 
 
-class SimCapture:
+class SimCapture(Capture):
     """A simulated `cv2.VideoCapture` on the world's clock.
 
     Frame k is stamped k / 30 s. Its exposure begins before, by the errors of `sim.frame_times`, and row by row (rolling

@@ -10,11 +10,11 @@ from pathlib import Path
 from rig.bench.computer import SERIAL_NAMES, Computer, User
 from rig.config import RigConfig, ServoConfig
 from rig.core.errors import DeviceNotFound, RigError
+from rig.devices.camera import Capture
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import control_table
-from rig.devices.opencv_capture import Capture
 from rig.devices.v4l2 import CAPTURE
 from sim.camera import CAMERA_DEVICE
 from sim.devices import SimDevices

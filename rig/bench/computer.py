@@ -22,8 +22,8 @@ from rig.core.clock import Clock, SystemClock
 from rig.core.errors import BenchBusy
 
 if TYPE_CHECKING:
+    from rig.devices.camera import Capture
     from rig.devices.dynamixel.port import SerialConnection
-    from rig.devices.opencv_capture import Capture
 
 SERIAL_NAMES = re.compile(r"tty(USB|ACM|AMA|S)\d+")
 _CAMERAS = "sys/class/video4linux"

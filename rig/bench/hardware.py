@@ -18,7 +18,7 @@ from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
 from rig.core.masking import masked
 from rig.core.phrases import angle_range
-from rig.devices.camera import Camera
+from rig.devices.camera import Camera, Capture
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.servo import open_servo
@@ -26,7 +26,6 @@ from rig.devices.head.head import RigHead, open_head, powered
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, open_imu
 from rig.devices.opencv_camera import OpenCvCamera
-from rig.devices.opencv_capture import Capture
 from rig.devices.servo import Servo
 from rig.devices.trace import Device, TracedI2c, TracedSerial, TraceWriter
 from rig.safety.saved_state import BenchLock, FileStore, StateStore

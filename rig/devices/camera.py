@@ -1,11 +1,13 @@
-"""The interface of a camera."""
+"""The interface of a camera, and that of a source of frames which OpenCV opens."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rig.devices.v4l2 import VideoMode
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,3 +93,31 @@ class Camera(Protocol):
         """Return the settings as the camera reports them now."""
 
     def close(self) -> None: ...
+
+
+class Capture(Protocol):
+    """The part of `cv2.VideoCapture` that the driver uses, and what it lacks; another source subclasses it."""
+
+    def isOpened(self) -> bool: ...  # noqa: N802
+
+    def grab(self) -> bool: ...
+    def retrieve(self) -> tuple[bool, Any]: ...
+    def get(self, propId: int, /) -> float:
+        """Return a property or, by its V4L2 number, a control; -1 if the camera lacks it."""
+
+    def set(self, propId: int, value: float, /) -> bool: ...
+    def release(self) -> None: ...
+    def modes(self) -> tuple[VideoMode, ...]:
+        """Return the modes that the source offers; empty if it does not tell."""
+        return ()
+
+    def limits(self, propId: int, /) -> tuple[float, float] | None:  # noqa: ARG002
+        """Return the smallest value and the step of a setting; None if the source does not tell."""
+        return None
+
+    def wait(self, seconds: float) -> bool | None:  # noqa: ARG002
+        """Wait for a frame for at most this time; return whether `grab` then returns at once (it may fail).
+
+        None if the source cannot wait.
+        """
+        return None

@@ -24,8 +24,7 @@ from rig.config import CameraConfig
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices import v4l2
-from rig.devices.camera import CameraIdentity, CameraLocks, Frame
-from rig.devices.opencv_capture import Capture, limits_of, modes_of, waiter_of
+from rig.devices.camera import CameraIdentity, CameraLocks, Capture, Frame
 from rig.devices.v4l2 import choose_mode
 
 V4L2_EXPOSURE_MANUAL = 1  # V4L2_EXPOSURE_MANUAL of linux/v4l2-controls.h
@@ -120,7 +119,7 @@ class OpenCvCamera:
         self._node_opened = node()
         self._settings = settings or CameraConfig()
         self._missing = capture.get(_UNKNOWN_PROPERTY)
-        self.modes = modes_of(capture)
+        self.modes = capture.modes()
         self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
         self.returns = 0
         self._clock = clock
@@ -177,17 +176,9 @@ class OpenCvCamera:
                     evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
                 )
 
-    @property
-    def controls(self) -> tuple[v4l2.VideoControl, ...]:
-        """The controls that the camera offers, with their present values; none if the source does not tell."""
-        found: tuple[v4l2.VideoControl, ...] = self._capture.controls() if hasattr(self._capture, "controls") else ()
-        return found
-
     def read_locks(self) -> CameraLocks:
-        reported = {name: (self._known(prop), convert) for name, (prop, convert) in _LOCKS.items()}
-        return CameraLocks(
-            **{name: None if value is None else convert(value) for name, (value, convert) in reported.items()}
-        )
+        reported = {name: (convert, self._known(prop)) for name, (prop, convert) in _LOCKS.items()}
+        return CameraLocks(**{name: value if value is None else to(value) for name, (to, value) in reported.items()})
 
     def close(self) -> None:
         self._capture.release()
@@ -204,7 +195,7 @@ class OpenCvCamera:
                 return
             if prop == cv2.CAP_PROP_AUTO_EXPOSURE and self._lacks(prop):
                 return
-            smallest, step = limits_of(self._capture, prop)
+            smallest, step = self._capture.limits(prop) or (0.0, 0.0)
             if prop == cv2.CAP_PROP_GAIN:
                 value = max(value, smallest)
             asked.append((name, prop, value, max(step / 2, 0 if name == "fourcc" else 0.01 * abs(value))))
@@ -213,7 +204,10 @@ class OpenCvCamera:
             if convertible and self._capture.set(prop, value):
                 self._supported.add(prop)
 
-        if (fourcc := self._pixel_format(settings)) is not None:  # before the size: it selects the sizes
+        fourcc = settings.fourcc
+        if fourcc is None and (mode := choose_mode(self.modes, settings.width, settings.height, settings.fps)):
+            fourcc = mode.fourcc
+        if fourcc is not None:  # before the size: it selects the sizes
             ask("fourcc", cv2.CAP_PROP_FOURCC, v4l2.fourcc_number(fourcc))
         ask("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width)
         ask("height", cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
@@ -244,13 +238,6 @@ class OpenCvCamera:
     def _lacks(self, prop: int) -> bool:
         """Return whether the camera says that it lacks a control."""
         return self._missing < 0 and self._capture.get(prop) == self._missing
-
-    def _pixel_format(self, settings: CameraConfig) -> str | None:
-        """Return the pixel format to request; None leaves it to the camera."""
-        if settings.fourcc is not None:
-            return settings.fourcc
-        mode = choose_mode(self.modes, settings.width, settings.height, settings.fps)
-        return None if mode is None else mode.fourcc
 
     def _known(self, prop: int) -> float | None:
         """Return a property; None if the camera lacks it: -1 on V4L2, where 0 is a true 0; else 0 if it was not set."""
@@ -303,16 +290,16 @@ class OpenCvCamera:
     def _await(self, meanwhile: Callable[[], object]) -> None:
         """Wait until `grab` can return at once, because it blocks for ten seconds if a stream of V4L2 hangs.
 
-        If the source does not report this, wait until shortly before the next frame, estimated from the last ones.
+        If the source cannot wait, this waits until shortly before the next frame, estimated from the last ones.
 
         Raises `DeviceSilent`: the stream hangs.
         """
-        if wait := waiter_of(self._capture):
-            limit_s, begun_ns = max(TIMEOUT_S, 3 * max(self._waits_s)), self._clock.now_ns()
-            while not wait(_SLICE_S):
-                if seconds_between(begun_ns, self._clock.now_ns()) > limit_s:
-                    raise self._no_frames(1, limit_s)
-                meanwhile()
+        limit_s, begun_ns = max(TIMEOUT_S, 3 * max(self._waits_s)), self._clock.now_ns()
+        while (ready := self._capture.wait(_SLICE_S)) is False:
+            if seconds_between(begun_ns, self._clock.now_ns()) > limit_s:
+                raise self._no_frames(1, limit_s)
+            meanwhile()
+        if ready:
             return
         spacing_s, now_ns = max(self._waits_s), self._clock.now_ns()
         frames = 1 + floor(seconds_between(self._arrived_ns, now_ns) / spacing_s)
@@ -357,19 +344,17 @@ class OpenCvCamera:
         # Set it up as before, and accept no other camera.
         meanwhile()
         self._last_stamp_ns = -1
-        rejected_settings, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        got, expected = (
-            tuple(round(self._capture.get(prop)) for prop in mode),
-            (self.identity.width, self.identity.height),
-        )
+        rejected_settings = self._configure(self._settings)
+        expected = [self.identity.width, self.identity.height]
+        got = [round(self._capture.get(prop)) for prop in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
         meanwhile()
         if got != expected or rejected_settings != self.rejected_settings:
             raise DeviceMismatch(
                 f"{self.identity.name} is another camera after it was unplugged, or has other settings.",
                 next_step="Connect the first camera again, or start again with this one.",
                 evidence={
-                    "expected": list(expected),
-                    "got": list(got),
+                    "expected": expected,
+                    "got": got,
                     "rejected_settings": [n.setting for n in rejected_settings],
                 },
             )

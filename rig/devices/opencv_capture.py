@@ -6,27 +6,15 @@ import stat
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import cv2
 
 from rig.core.camera_node import camera_node
 from rig.core.errors import DeviceNotFound
 from rig.devices import v4l2
+from rig.devices.camera import Capture
 from rig.devices.picamera2_capture import Picamera2Capture, camera_number
-
-
-class Capture(Protocol):
-    """The part of `cv2.VideoCapture` that the driver uses."""
-
-    def isOpened(self) -> bool: ...  # noqa: N802
-
-    def grab(self) -> bool: ...
-    def retrieve(self) -> tuple[bool, Any]: ...
-    def get(self, propId: int, /) -> float: ...
-    def set(self, propId: int, value: float, /) -> bool: ...
-    def release(self) -> None: ...
-
 
 _CONTROLS: Final = {  # linux/v4l2-controls.h
     cv2.CAP_PROP_GAIN: 0x0098_0913,
@@ -39,66 +27,51 @@ _CONTROLS: Final = {  # linux/v4l2-controls.h
 """Numbers of the controls whose values are a range."""
 
 
-class V4l2Capture:
-    """An open `cv2.VideoCapture` of a device file, with the controls that OpenCV lacks, by their V4L2 numbers."""
+class OpenedCapture(Capture):
+    """An open `cv2.VideoCapture`, and what OpenCV lacks if it is that of a device file ``path``."""
 
-    def __init__(self, capture: cv2.VideoCapture, path: str) -> None:
+    def __init__(self, capture: cv2.VideoCapture, path: str | None = None) -> None:
         self._capture = capture
-        self._path = Path(path)
-        self.isOpened = capture.isOpened
-        self.grab = capture.grab
-        self.retrieve = capture.retrieve
-        self.release = capture.release
-        self.wait = waiter_for(path)
+        self._path = None if path is None else Path(path)
+        self._waiter = None if path is None else waiter_for(path)
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return self._capture.isOpened()
+
+    def grab(self) -> bool:
+        return self._capture.grab()
+
+    def retrieve(self) -> tuple[bool, Any]:
+        return self._capture.retrieve()
+
+    def release(self) -> None:
+        self._capture.release()
+
+    def wait(self, seconds: float) -> bool | None:
+        return None if self._waiter is None else self._waiter(seconds)
 
     def get(self, propId: int, /) -> float:
-        """Return a property or a control; -1 if the camera lacks it."""
-        if propId < v4l2.FIRST_CONTROL:
+        if propId < v4l2.FIRST_CONTROL or self._path is None:
             return self._capture.get(propId)
         value = v4l2.get_control(self._path, propId)
         return -1.0 if value is None else float(value)
 
-    def modes(self) -> tuple[v4l2.VideoMode, ...]:
-        """Return the modes that the camera offers."""
-        return v4l2.modes(self._path)
-
-    def limits(self, propId: int) -> tuple[float, float] | None:
-        """Return the smallest value and the step of a setting; None if the camera does not tell."""
-        return v4l2.control_limits(self._path, _CONTROLS[propId]) if propId in _CONTROLS else None
-
-    def controls(self) -> tuple[v4l2.VideoControl, ...]:
-        """Return the controls that the camera offers."""
-        return v4l2.controls(self._path)
-
     def set(self, propId: int, value: float, /) -> bool:
-        if propId < v4l2.FIRST_CONTROL:
+        if propId < v4l2.FIRST_CONTROL or self._path is None:
             return self._capture.set(propId, value)
         return v4l2.set_control(self._path, propId, round(value))
 
+    def modes(self) -> tuple[v4l2.VideoMode, ...]:
+        return () if self._path is None else v4l2.modes(self._path)
 
-def modes_of(capture: Capture) -> tuple[v4l2.VideoMode, ...]:
-    """Return the modes that a source offers; empty for a file or a stream."""
-    modes: tuple[v4l2.VideoMode, ...] = capture.modes() if hasattr(capture, "modes") else ()
-    return modes
-
-
-def limits_of(capture: Capture, prop: int) -> tuple[float, float]:
-    """Return the smallest value and the step of a setting; 0 and 0 if the source does not tell."""
-    limits: tuple[float, float] | None = capture.limits(prop) if hasattr(capture, "limits") else None
-    return limits or (0.0, 0.0)
-
-
-def waiter_of(capture: Capture) -> Callable[[float], bool] | None:
-    """Return the function that waits for a frame of a source for a number of seconds; None if it has none.
-
-    It returns whether `grab` then returns at once: with a frame, or because it fails.
-    """
-    wait: Callable[[float], bool] | None = getattr(capture, "wait", None)
-    return wait
+    def limits(self, propId: int, /) -> tuple[float, float] | None:
+        if self._path is None or propId not in _CONTROLS:
+            return None
+        return v4l2.control_limits(self._path, _CONTROLS[propId])
 
 
 def waiter_for(path: str | Path) -> Callable[[float], bool] | None:
-    """Return the function of `waiter_of` for a device file that this process has opened once; else None.
+    """Return a function like `Capture.wait` for a device file that this process has opened once; else None.
 
     OpenCV's own `waitAny` takes the frame, and `grab` then returns the same frame until it is decoded.
     """
@@ -132,7 +105,8 @@ def open_capture(source: int | str | Path) -> Capture:
         return Picamera2Capture(number)
     path = camera_node(source)
     if path is None:
-        return _opened(str(source), cv2.CAP_ANY, "Check the path or address, and that OpenCV can decode its format.")
+        step = "Check the path or address, and that OpenCV can decode its format."
+        return OpenedCapture(_opened(str(source), cv2.CAP_ANY, step))
     if not Path(path).exists():
         there = sorted(str(p) for p in Path("/dev").glob("video*"))
         raise DeviceNotFound(
@@ -147,7 +121,7 @@ def open_capture(source: int | str | Path) -> Capture:
             evidence={"path": path},
         )
     step = f"Close the program that uses it (`fuser -v {path}`), or try the camera's next number."
-    return V4l2Capture(_opened(path, cv2.CAP_V4L2, step), path)
+    return OpenedCapture(_opened(path, cv2.CAP_V4L2, step), path)
 
 
 def _opened(path: str, backend: int, next_step: str) -> cv2.VideoCapture:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rig.core.errors import DeviceNotFound
 from rig.core.next_steps import Do
 from rig.devices import v4l2
+from rig.devices.camera import Capture
 
 INSTALL: Final = (
     "Install it: `sudo apt install -y python3-picamera2`, and make the Python environment with access to it: "
@@ -40,13 +41,26 @@ _SETTLE_FRAMES: Final = 12
 """Frames after which changed settings are certainly in force: sensor and image processor delay them by several."""
 _NOMINAL_FPS: Final = 30.0  # until the frame durations of the sensor's mode are known
 _MANUAL_FOCUS, _CONTINUOUS_FOCUS = 0, 2  # libcamera's AfMode
-_REPORTED: Final[Mapping[int, tuple[str, Callable[[float], Any], Callable[[float], float]]]] = {
+_Setting = tuple[str, Callable[[float], Any], Callable[[Any], float]]
+"""libcamera's name of a setting, what is requested of it, and what its value means."""
+_REQUESTED: Final[Mapping[int, _Setting]] = {
+    cv2.CAP_PROP_AUTO_EXPOSURE: ("AeEnable", lambda v: v != 1, lambda on: 3.0 if on else 1.0),
+    cv2.CAP_PROP_AUTO_WB: ("AwbEnable", bool, float),
+    cv2.CAP_PROP_AUTOFOCUS: (
+        "AfMode",
+        lambda v: _CONTINUOUS_FOCUS if v else _MANUAL_FOCUS,
+        lambda mode: float(mode != _MANUAL_FOCUS),
+    ),
+    cv2.CAP_PROP_SHARPNESS: ("Sharpness", float, lambda v: round(float(v), 2)),
+}
+"""Settings that no frame reports: libcamera keeps to what was requested."""
+_REPORTED: Final[Mapping[int, _Setting]] = {
     cv2.CAP_PROP_EXPOSURE: ("ExposureTime", lambda v: round(v * 100), lambda v: max(float(round(v / 100)), 1.0)),
     cv2.CAP_PROP_GAIN: ("AnalogueGain", lambda v: 10 ** (v / 20), lambda v: max(round(20 * log10(v), 1), 0.0)),
     cv2.CAP_PROP_WB_TEMPERATURE: ("ColourTemperature", round, lambda v: float(round(v, -1))),
     cv2.CAP_PROP_FOCUS: ("LensPosition", float, lambda v: round(v, 2)),
 }
-"""Settings that the metadata of a frame report: libcamera's name, what is requested of it, and what a report means."""
+"""Settings that the metadata of a frame report."""
 
 
 def camera_number(source: object) -> int | None:
@@ -82,8 +96,8 @@ def import_picamera2() -> Any:
         ) from error
 
 
-class Picamera2Capture:
-    """An open camera of a Raspberry Pi, as a `rig.devices.opencv_capture.Capture`.
+class Picamera2Capture(Capture):
+    """An open camera of a Raspberry Pi, as a `rig.devices.camera.Capture`.
 
     Units are those of OpenCV's V4L2 backend where there are any: exposure in 100 µs, white balance in kelvin. Gain is
     in decibels (20 log10 of libcamera's AnalogueGain), focus in dioptres (LensPosition), sharpness as libcamera's.
@@ -192,21 +206,15 @@ class Picamera2Capture:
                 return self._exposed_ms()
             case v4l2.EXPOSURE_DYNAMIC_FRAMERATE if "FrameDurationLimits" in self._controls:
                 return float(not self._fixed_rate)
-            case cv2.CAP_PROP_AUTO_EXPOSURE if "AeEnable" in self._controls:
-                return 3.0 if self._asked.get("AeEnable", True) else 1.0
-            case cv2.CAP_PROP_AUTO_WB if "AwbEnable" in self._controls:
-                return float(self._asked.get("AwbEnable", True))
-            case cv2.CAP_PROP_AUTOFOCUS if "AfMode" in self._controls:
-                return float(self._asked.get("AfMode", _MANUAL_FOCUS) != _MANUAL_FOCUS)
-            case cv2.CAP_PROP_SHARPNESS if "Sharpness" in self._controls:
-                return round(float(self._asked.get("Sharpness", self._controls["Sharpness"][2])), 2)
-            case _ if propId in _REPORTED and _REPORTED[propId][0] in self._controls:
-                name, _, meant = _REPORTED[propId]
-                return self._reported(name, meant)
+            case _ if propId in _REQUESTED and (name := _REQUESTED[propId][0]) in self._controls:
+                # Until something is requested, the automatics are on, and a value is the default one.
+                initial = True if name in ("AeEnable", "AwbEnable") else self._controls[name][2]
+                return _REQUESTED[propId][2](self._asked.get(name, initial))
+            case _ if propId in _REPORTED and (name := _REPORTED[propId][0]) in self._controls:
+                return self._reported(name, _REPORTED[propId][2])
         return -1.0
 
-    def limits(self, propId: int) -> tuple[float, float] | None:
-        """Return the smallest gain; see `V4l2Capture.limits`."""
+    def limits(self, propId: int, /) -> tuple[float, float] | None:
         if propId != cv2.CAP_PROP_GAIN or "AnalogueGain" not in self._controls:
             return None
         return round(20 * log10(self._controls["AnalogueGain"][0]), 1), 0.1
@@ -223,18 +231,10 @@ class Picamera2Capture:
             case v4l2.EXPOSURE_DYNAMIC_FRAMERATE if not value:
                 self._fixed_rate = self._control("FrameDurationLimits", (round(1e6 / self._fps),) * 2)
                 return self._fixed_rate
-            case cv2.CAP_PROP_AUTO_EXPOSURE:
-                return self._control("AeEnable", value != 1)
-            case cv2.CAP_PROP_AUTO_WB:
-                return self._control("AwbEnable", bool(value))
-            case cv2.CAP_PROP_AUTOFOCUS:
-                return self._control("AfMode", _CONTINUOUS_FOCUS if value else _MANUAL_FOCUS)
-            case _ if propId in _REPORTED:
-                name, requested, _ = _REPORTED[propId]
-                return self._control(name, requested(value))
-            case cv2.CAP_PROP_SHARPNESS:
-                return self._control("Sharpness", value)
-        return False
+        if (setting := {**_REQUESTED, **_REPORTED}.get(propId)) is None:
+            return False
+        name, requested, _ = setting
+        return self._control(name, requested(value))
 
     # -- libcamera ----------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,6 @@ from rig.core.errors import DeviceNotFound, RigError
 from rig.core.next_steps import Do
 from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
-from rig.devices.opencv_capture import modes_of
 from rig.devices.picamera2_capture import import_picamera2
 from rig.devices.v4l2 import VideoMode, choose_mode
 from rig.doctor.computer import access, i2c_command
@@ -178,7 +177,7 @@ class DeviceScan:
                 yield of_error(error)
                 continue
             width, height = (round(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-            fps, modes = capture.get(cv2.CAP_PROP_FPS), modes_of(capture)
+            fps, modes = capture.get(cv2.CAP_PROP_FPS), capture.modes()
             capture.release()
             self.candidates["camera"].append(camera_settings(node, modes))
             text = "{path}: {name}: {width}x{height} at {fps:.3g} frames/s"

@@ -17,15 +17,15 @@ from rig.bench.hardware import HardwareBench
 from rig.config import RigConfig, Section
 from rig.core.errors import ConfigError, DeviceNotFound
 from rig.core.next_steps import Do
+from rig.devices.camera import Capture
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.opencv_capture import Capture
 from rig.safety.saved_state import holder
 from sim.camera import CAMERA_DEVICE
 from sim.i2c import KernelBus, Messages
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, Wire, not_running
 
 
-class RemoteCapture:
+class RemoteCapture(Capture):
     """The simulated bench's camera; behaves like `cv2.VideoCapture`.
 
     Raises `DeviceNotFound`: the simulated bench is not running, its camera is unplugged, or another program uses it.

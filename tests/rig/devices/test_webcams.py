@@ -12,7 +12,7 @@ from rig.config import CameraConfig
 from rig.core.next_steps import Do
 from rig.devices import v4l2
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
-from rig.devices.opencv_capture import V4l2Capture, limits_of
+from rig.devices.opencv_capture import OpenedCapture
 from rig.devices.v4l2 import CAPTURE, VideoMode, choose_mode
 from rig.doctor.device_scan import camera_settings
 from sim.world import World
@@ -109,10 +109,10 @@ def test_limits_of_a_control_are_those_of_the_driver(monkeypatch: pytest.MonkeyP
     node = tmp_path / "video0"
     node.touch()
     monkeypatch.setattr(v4l2, "ioctl", driver({}, controls={0x0098_0913: (1, 128, 1), 0x0098_091A: (2800, 12500, 100)}))
-    capture = V4l2Capture(cv2.VideoCapture(), str(node))
-    assert limits_of(capture, cv2.CAP_PROP_GAIN) == (1, 1)
-    assert limits_of(capture, cv2.CAP_PROP_WB_TEMPERATURE) == (2800, 100)
-    assert limits_of(capture, cv2.CAP_PROP_FOCUS) == limits_of(capture, cv2.CAP_PROP_FPS) == (0, 0)
+    capture = OpenedCapture(cv2.VideoCapture(), str(node))
+    assert capture.limits(cv2.CAP_PROP_GAIN) == (1, 1)
+    assert capture.limits(cv2.CAP_PROP_WB_TEMPERATURE) == (2800, 100)
+    assert capture.limits(cv2.CAP_PROP_FOCUS) is capture.limits(cv2.CAP_PROP_FPS) is None
 
 
 def test_doctor_names_what_a_camera_lacks_with_the_setting_that_accepts_it(world: World) -> None:
