@@ -6,8 +6,7 @@ The rows, with the units of each model, are in `rig.config.servos`.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
-from struct import Struct
-from typing import Any, Self
+from typing import Any
 
 from rig.config.servos import (
     GROUP,
@@ -32,9 +31,6 @@ _SIGNED = frozenset(
 # A register that is missing in the .model files: (address, size, name), and its first firmware by model.
 _STARTUP = (60, 1, "Startup Configuration")
 _STARTUP_FIRMWARE = {"xl330": 46, "xc330": 46, "x": 45}
-
-
-_LETTERS = {1: "b", 2: "h", 4: "i"}  # formats of the module struct, signed
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,30 +62,10 @@ class ControlTable(dict[str, Register]):
         self.row = row
         self.ram_start = row.ram_start
 
-
-@dataclass(frozen=True, slots=True)
-class Block:
-    """Adjacent registers that are read in one transaction."""
-
-    address: int
-    layout: Struct
-    names: tuple[str, ...]
-
-    @classmethod
-    def of(cls, table: ControlTable, first: str, last: str) -> Self:
-        """Return the registers of ``table`` from ``first`` to ``last``; bytes between them are skipped."""
-        start, end = table[first].address, table[last].address + table[last].size
-        registers = sorted((r for r in table.values() if start <= r.address < end), key=lambda r: r.address)
-        layout, at = "<", start
-        for register in registers:
-            letter = _LETTERS[register.size]
-            layout += f"{register.address - at}x{letter if register.signed else letter.upper()}"
-            at = register.address + register.size
-        return cls(start, Struct(layout), tuple(register.name for register in registers))
-
-    def values(self, image: bytes) -> dict[str, int]:
-        """Return the values in the bytes from `address` on, by register."""
-        return dict(zip(self.names, self.layout.unpack(image), strict=True))
+    def decoded(self, start: int, image: bytes) -> dict[str, int]:
+        """Return the values of the registers that lie in ``image``, the bytes from address ``start`` on."""
+        found = ((r, r.address - start) for r in self.values())
+        return {r.name: r.decode(image[at : at + r.size]) for r, at in found if 0 <= at <= len(image) - r.size}
 
 
 def servo_plugin(model: str) -> Any:

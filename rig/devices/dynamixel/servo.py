@@ -18,14 +18,7 @@ from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
-from rig.devices.dynamixel.registers import (
-    Block,
-    ControlTable,
-    control_table,
-    model_of,
-    require_driven,
-    servo_plugin,
-)
+from rig.devices.dynamixel.registers import ControlTable, control_table, model_of, require_driven, servo_plugin
 from rig.devices.dynamixel.settings import Mode, SettingDifference
 from rig.devices.servo import MotionProfile, Servo, ServoCondition, ServoIdentity, ServoLimits, ServoState
 
@@ -93,7 +86,6 @@ class DynamixelServo:
         self._dps_per_unit = row.dps_per_unit / gear_ratio
         self._dps2_per_unit = row.dps2_per_unit / gear_ratio
         self._kept: dict[str, int] = {}  # the permanent settings
-        self._blocks: dict[tuple[str, str], Block] = {}
         self._tick: _Tick | None = None  # of the last fresh reading
         self._unconfirmed: list[_Tick] = []  # of readings that agree with each other, but not with it
 
@@ -321,10 +313,8 @@ class DynamixelServo:
 
         ``dated`` if the registers contain the servo's clock, which the caller checks.
         """
-        block = self._blocks.get((first, last))
-        if block is None:
-            block = self._blocks[first, last] = Block.of(self._table, first, last)
-        return block.values(self.bus.read_block(self._id, block.address, block.layout.size, dated=dated))
+        start, end = self._table[first].address, self._table[last].address + self._table[last].size
+        return self._table.decoded(start, self.bus.read_block(self._id, start, end - start, dated=dated))
 
     def _read_fresh(self) -> tuple[int, dict[str, int]]:
         """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""

@@ -32,17 +32,13 @@ _OPERATING_MODES: Final = {
 }
 _DRIVE_MODE_BITS = 0b1101
 """Drive Mode bits that must be 0: reverse direction, time-based profile, and torque on by goal update."""
-# e-manual, Shutdown: the factory settings, with the bits of Hardware Error Status
-_SHUTDOWN = 0b110100, "overload, short circuit and overheating switch the torque off"
+_SHUTDOWN = 0b110100  # e-manual, Shutdown: the factory settings, with the bits of Hardware Error Status
 _NEAR = 16  # largest gap over which it is faster to read on: in the P series the RAM begins 448 bytes later
 
 
-def wanted(found: Mapping[str, int], mode: Mode) -> dict[str, tuple[int, str]]:
-    """Return the required values and their reasons by register, for the present settings of a servo.
-
-    ``found`` has the registers of the model only.
-    """
-    shutdown, why = _SHUTDOWN
+def differing(found: Mapping[str, int], mode: Mode) -> list[SettingDifference]:
+    """Return the settings that differ from what the rig needs; ``found`` has the registers of the model only."""
+    # What each register must contain, and why.
     needs = {
         "Drive Mode": (
             found["Drive Mode"] & ~_DRIVE_MODE_BITS,
@@ -53,36 +49,32 @@ def wanted(found: Mapping[str, int], mode: Mode) -> dict[str, tuple[int, str]]:
         "Return Delay Time": (0, "no delay of replies; the factory setting of 250 costs 0.5 ms per reading"),
         "Secondary ID": (255, "off: else the servo obeys instructions to a second id"),
         "Startup Configuration": (0, "no torque and no old goal at power-up"),
-        "Shutdown": (found["Shutdown"] | shutdown, why),
+        "Shutdown": (
+            found["Shutdown"] | _SHUTDOWN,
+            "overload, short circuit and overheating switch the torque off",
+        ),
         "Status Return Level": (2, "the servo answers each instruction, so a lost one is noticed"),
     }
-    return {name: need for name, need in needs.items() if name in found}
+    return [
+        SettingDifference(name, found[name], value, reason)
+        for name, (value, reason) in needs.items()
+        if name in found and found[name] != value
+    ]
 
 
 def read(bus: DynamixelBus, bus_id: int, table: ControlTable) -> dict[str, int]:
-    """Return the registers that survive without supply, and the Status Return Level, by name."""
+    """Return the registers that survive without supply and the Status Return Level, and those between, by name."""
     kept = [r for r in table.values() if r.address < table.ram_start and not r.name.startswith("Indirect")]
     level = table["Status Return Level"]
     end = max(register.address + register.size for register in kept)
-    near = level.address < end + _NEAR
-    kept += [level] if near and level not in kept else []
-    image = bus.read_block(bus_id, 0, max(end, level.address + level.size) if near else end)
-    values = {r.name: r.decode(image[r.address : r.address + r.size]) for r in kept}
-    return values | ({} if near else {level.name: bus.read(bus_id, level)})
+    if level.address < end + _NEAR:
+        return table.decoded(0, bus.read_block(bus_id, 0, max(end, level.address + level.size)))
+    return {**table.decoded(0, bus.read_block(bus_id, 0, end)), level.name: bus.read(bus_id, level)}
 
 
 def compare(bus: DynamixelBus, bus_id: int, table: ControlTable, mode: Mode = "turntable") -> list[SettingDifference]:
     """Return the settings of a servo that differ from what the rig needs; write nothing."""
     return differing(read(bus, bus_id, table), mode)
-
-
-def differing(found: Mapping[str, int], mode: Mode) -> list[SettingDifference]:
-    """Return the settings that differ from what the rig needs."""
-    return [
-        SettingDifference(name, found[name], value, reason)
-        for name, (value, reason) in wanted(found, mode).items()
-        if found[name] != value
-    ]
 
 
 def write(bus: DynamixelBus, bus_id: int, table: ControlTable, differences: Sequence[SettingDifference]) -> None:
