@@ -16,13 +16,10 @@ from rig.config.imus import imu_kind
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import ControllerHangs, DeviceFault, DeviceSilent
 from rig.devices.i2c import AnyBus
-from rig.devices.imu import I2cImu, ImuIdentity, ImuSamples, identified
+from rig.devices.imu import I2cImu, ImuSamples
 
 Floats = NDArray[np.float64]
 
-KIND = imu_kind("bno055")
-NOISE_DPS_RTHZ = 0.014
-"""Output noise density of the gyroscope (table 0-2)."""
 RATE_HZ, RANGE_DPS = 100.0, 2000.0
 """Rate and range of its fusion modes, in which the sensor sets them itself (3.5)."""
 LSB_PER_DPS, LSB_PER_MS2, LSB_PER_QUATERNION = 16.0, 100.0, 16384.0
@@ -64,11 +61,13 @@ class Bno055(I2cImu):
     are further apart than the gyro's period, they are interpolated. Therefore the rates are only correct if the sensor
     is read while the table moves, as the control loop does.
 
-    Raises `DeviceNotFound`: the bus cannot be opened, or no device acknowledges the address, even a second after
-    power-up. `DeviceMismatch`: another device answers there. `DeviceFault`: its fusion does not run, or it does not
-    keep its settings.
+    Raises `DeviceFault`: its fusion does not run, or it does not keep its settings. Others as `I2cImu`, even a second
+    after power-up.
     """
 
+    KIND = imu_kind("bno055")
+    NOISE_DPS_RTHZ = 0.014  # table 0-2
+    ADDRESS_PIN = "ADR pin (low 0x28, high 0x29)"
     rate_hz = RATE_HZ
     range_dps = RANGE_DPS
     _last: _Reading
@@ -121,28 +120,29 @@ class Bno055(I2cImu):
 
     # -- setting up ---------------------------------------------------------------------------------------------------
 
-    def _identify(self) -> ImuIdentity:
+    def _read_identity(self) -> int:
         deadline_ns = self._clock.now_ns() + round(_START_S * 1e9)
         while True:
             try:
-                got = self._registers.read(KIND.register, 1)[0]
+                got = super()._read_identity()
                 break
             except ControllerHangs:
                 raise
-            except DeviceSilent as silent:
+            except DeviceSilent:
                 if self._clock.now_ns() > deadline_ns:
-                    raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent
+                    raise
                 self._clock.sleep(_POLL_S)
         # A wrong identity that changes, or is one bit late, comes from the bus, and not from another chip.
-        if got not in KIND.identities:
-            again = {self._registers.read(KIND.register, 1)[0] for _ in range(_IDENTITY_READS)}
-            if again & {*KIND.identities, *(_late_by_one_bit(one) for one in KIND.identities)} or len(again) > 1:
+        right = self.KIND.identities
+        if got not in right:
+            again = {super(Bno055, self)._read_identity() for _ in range(_IDENTITY_READS)}
+            if again & {*right, *(_late_by_one_bit(one) for one in right)} or len(again) > 1:
                 raise DeviceFault(
                     f"The bus {self._registers.name} corrupts the answers of the BNO055.",
                     next_step=SLOW_BUS,
-                    evidence={"identity": sorted(again | {got}), "expected": list(KIND.identities)},
+                    evidence={"identity": sorted(again | {got}), "expected": list(right)},
                 )
-        return identified(KIND, got, self._registers.address, self._registers.name, NOISE_DPS_RTHZ)
+        return got
 
     def _set_up(self) -> None:
         self._registers.write(_PAGE_ID, 0)

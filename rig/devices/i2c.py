@@ -151,16 +151,6 @@ class I2cRegisters:
             evidence={"errno": EBUSY, "driver": driver},
         )
 
-    def not_found(self, silent: DeviceSilent, pin: str) -> DeviceNotFound:
-        """Return the error for a sensor that never answered; ``pin`` names the pin that sets its address."""
-        return DeviceNotFound(
-            f"No sensor answers at I2C address {self.address:#04x} of {self.name}.",
-            next_step=f"Check the sensor's supply, SDA, SCL and ground, and the {pin}; "
-            f"`i2cdetect -y {self.name.removeprefix('/dev/i2c-')}` lists the addresses that answer (UU: a "
-            "kernel driver uses the address).",
-            evidence=silent.evidence,
-        )
-
 
 def controller_hangs(path: str, failures: Iterable[int]) -> bool:
     """Return whether the errors of consecutive transfers are those of a controller that hangs.

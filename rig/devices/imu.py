@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rig.config import ImuConfig
 from rig.config.imus import ImuKind, imu_kind, likely_device, recognised
 from rig.core.clock import Clock
-from rig.core.errors import ConfigError, DeviceMismatch
+from rig.core.errors import ConfigError, ControllerHangs, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do
 from rig.devices.i2c import AnyBus, I2cRegisters
 
@@ -97,7 +97,17 @@ class FifoTimes:
 
 
 class I2cImu:
-    """What the drivers of sensors on an I2C bus of the computer share; if they cannot be opened, the bus is closed."""
+    """What the drivers of sensors on an I2C bus of the computer share; if they cannot be opened, the bus is closed.
+
+    Raises `DeviceNotFound`: the bus cannot be opened, or no device acknowledges the address. `DeviceMismatch`: another
+    device answers there.
+    """
+
+    KIND: ClassVar[ImuKind]
+    NOISE_DPS_RTHZ: ClassVar[float]
+    """Output noise density of the gyro by the datasheet."""
+    ADDRESS_PIN: ClassVar[str]
+    """The pin that sets the address, in words."""
 
     def __init__(self, bus: AnyBus, clock: Clock, address: int) -> None:
         self._clock = clock
@@ -111,21 +121,29 @@ class I2cImu:
             self.close()
             raise
 
-    @abstractmethod
-    def _identify(self) -> ImuIdentity: ...
+    def _identify(self) -> ImuIdentity:
+        bus, address = self._registers.name, self._registers.address
+        try:
+            got = self._read_identity()
+        except ControllerHangs:
+            raise
+        except DeviceSilent as silent:
+            raise DeviceNotFound(
+                f"No sensor answers at I2C address {address:#04x} of {bus}.",
+                next_step=f"Check the sensor's supply, SDA, SCL and ground, and the {self.ADDRESS_PIN}; "
+                f"`i2cdetect -y {bus.removeprefix('/dev/i2c-')}` lists the addresses that answer (UU: a "
+                "kernel driver uses the address).",
+                evidence=silent.evidence,
+            ) from silent
+        if got not in self.KIND.identities:
+            raise another_sensor(self.KIND, got, address, bus)
+        return ImuIdentity(self.KIND.name, address, got, self.NOISE_DPS_RTHZ)
+
+    def _read_identity(self) -> int:
+        return self._registers.read(self.KIND.register, 1)[0]
 
     @abstractmethod
     def _set_up(self) -> None: ...
-
-
-def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_rthz: float) -> ImuIdentity:
-    """Return the identity of a sensor whose identity register has the value ``got``.
-
-    Raises `DeviceMismatch`: it is another sensor than ``kind``.
-    """
-    if got not in kind.identities:
-        raise another_sensor(kind, got, address, bus)
-    return ImuIdentity(kind.name, address, got, gyro_noise_dps_rthz)
 
 
 def another_sensor(kind: ImuKind, got: int, address: int, bus: str) -> DeviceMismatch:

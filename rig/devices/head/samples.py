@@ -64,11 +64,11 @@ def head_sensor(config: ImuConfig) -> HeadSensor:
     """
     if config.model == "bno055":
         return HeadSensor(
-            kind=bno055.KIND,
+            kind=bno055.Bno055.KIND,
             setup=SetImu(ImuModel.BNO055, config.address, divider=0, filter=1, range=0),
             rate_hz=bno055.RATE_HZ,
             range_dps=bno055.RANGE_DPS,
-            noise_dps_rthz=bno055.NOISE_DPS_RTHZ,
+            noise_dps_rthz=bno055.Bno055.NOISE_DPS_RTHZ,
             lsb_per_dps=bno055.LSB_PER_DPS,
             lsb_per_g=1000.0,
             temperature_c=float,
