@@ -67,14 +67,6 @@ _REASONS: dict[int, str] = {
 }
 
 
-class FrameError(ValueError):
-    """The bytes between two zeros are not a frame."""
-
-
-class CrcError(FrameError):
-    """A frame whose checksum is wrong."""
-
-
 @dataclass(frozen=True, slots=True)
 class HeadFrame:
     """The content of a frame."""
@@ -89,24 +81,6 @@ def encode(frame: HeadFrame) -> bytes:
     content = bytes([frame.id, frame.sequence]) + frame.body
     encoded: bytes = cobs.encode(content + crc_hqx(content, 0xFFFF).to_bytes(CRC, "big"))
     return encoded + b"\0"
-
-
-def decode(line: bytes) -> HeadFrame:
-    """Return the frame in ``line``, the bytes between two zeros.
-
-    Raises `CrcError`: the checksum is wrong. `FrameError`: the bytes are not COBS, too few or too many.
-    """
-    if len(line) >= LONGEST:
-        raise FrameError(f"{len(line)} bytes, longer than any frame")
-    try:
-        content = cobs.decode(line)
-    except cobs.DecodeError as error:
-        raise FrameError(str(error)) from error
-    if len(content) < HEADER + CRC:
-        raise FrameError(f"{len(content)} bytes, shorter than any frame")
-    if crc_hqx(content, 0xFFFF):  # over data and its CRC the remainder is 0
-        raise CrcError(f"wrong checksum in {line.hex()}")
-    return HeadFrame(content[0], content[1], content[HEADER:-CRC])
 
 
 @dataclass(slots=True)
@@ -129,6 +103,22 @@ class HeadStatistics:
     restarts: int = 0
 
 
+def decode(line: bytes, statistics: HeadStatistics) -> HeadFrame | None:
+    """Return the frame in ``line``, the bytes between two zeros, and count it; None if it is not COBS, or damaged."""
+    content = b""
+    if len(line) < LONGEST:
+        with suppress(cobs.DecodeError):
+            content = cobs.decode(line)
+    if len(content) < HEADER + CRC:
+        statistics.malformed += 1
+    elif crc_hqx(content, 0xFFFF):  # over data and its CRC the remainder is 0
+        statistics.crc_errors += 1
+    else:
+        statistics.frames += 1
+        return HeadFrame(content[0], content[1], content[HEADER:-CRC])
+    return None
+
+
 class Deframer:
     """Splits a stream of bytes into frames, and counts invalid ones."""
 
@@ -142,14 +132,7 @@ class Deframer:
         # A frame that is too long is invalid: keep only enough of it to detect that.
         self._line[:] = rest[:LONGEST]
         for line in filter(None, lines):
-            try:
-                frame = decode(line)
-            except CrcError:
-                self._statistics.crc_errors += 1
-            except FrameError:
-                self._statistics.malformed += 1
-            else:
-                self._statistics.frames += 1
+            if frame := decode(line, self._statistics):
                 yield frame
 
     def missing(self, length: int) -> int:
@@ -200,14 +183,6 @@ class HeadLink:
 
     # -- the greeting -------------------------------------------------------------------------------------------------
 
-    def greet(self) -> None:
-        """Wait until the head answers, and check that it uses this program's protocol.
-
-        Raises `DeviceNotFound`: nothing answers that uses the protocol. `FirmwareMismatch`: the head uses another
-        version; the message says which side to update.
-        """
-        self.identity = self._greet()
-
     def identify(self) -> None:
         """Ask for the head's identity again, after it restarted."""
         self.identity = self.request(Hello(PROTOCOL_VERSION), Identity)
@@ -226,20 +201,21 @@ class HeadLink:
             )
         with suppress(OSError):
             self._connection.close()
+        expected = self.identity
         try:
             self._connection = self._reopen()
-            found = self._greet()
+            self.greet()
         except DeviceNotFound as gone:
             raise DeviceSilent(gone.what, next_step=gone.steps, evidence=gone.evidence) from gone
         same = ("board", "serial", "protocol", "major", "minor", "patch")
-        pairs = {name: (getattr(found, name), getattr(self.identity, name)) for name in same}
-        if changed := {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}:
+        pairs = {name: {"got": getattr(self.identity, name), "expected": getattr(expected, name)} for name in same}
+        if changed := {name: pair for name, pair in pairs.items() if pair["got"] != pair["expected"]}:
+            self.identity = expected  # the bench's own head may be connected later
             raise DeviceMismatch(
                 f"The rig head that now answers at {self.name} is a different one.",
                 next_step="Connect the bench's own head, or open the bench again.",
-                evidence={name: {"got": got, "expected": expected} for name, (got, expected) in changed.items()},
+                evidence=changed,
             )
-        self.identity = found
         self.statistics.reconnects += 1
 
     def store_serial(self, serial: int) -> None:
@@ -264,7 +240,12 @@ class HeadLink:
         self._deframer.reset()
         self._event_sequence = None
 
-    def _greet(self) -> Identity:
+    def greet(self) -> None:
+        """Wait until the head answers, and check that it uses this program's protocol.
+
+        Raises `DeviceNotFound`: nothing answers that uses the protocol. `FirmwareMismatch`: the head uses another
+        version; the message says which side to update.
+        """
         start_ns = self._clock.now_ns()
         while True:
             try:
@@ -292,7 +273,7 @@ class HeadLink:
                 else "Update this program: the head's firmware is newer.",
                 evidence={"head": found.protocol, "program": PROTOCOL_VERSION, "firmware": version(found)},
             )
-        return found
+        self.identity = found
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
