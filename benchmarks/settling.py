@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from calibration.procedure import Evaluation
 from calibration.ringing import Ringing
+from rig.calibrations import CalibrationResult
 from rig.config import load_config
 from rig.core.errors import MotionTimeout
 from rig.motion.turntable import Turntable
@@ -34,8 +34,8 @@ def settling_s(hz: float, damping: float, seed: int) -> dict[str, float]:
     world = World(noise=NoiseModel(structure_hz=hz, structure_damping=damping), seed=seed)
     config = load_config(None, ())
     with open_sim_bench(config, ShelfOperator(world, {}), open_now=("servo", "imu")) as bench:
-        *_, found = Ringing(6).measure(bench)
-        assert isinstance(found, Evaluation)
+        *_, found = Ringing(6).live(bench)
+        assert isinstance(found, CalibrationResult)
         ringing = {key.removeprefix("table."): value for key, value in found.settings.items()} if found.passed else {}
         with Turntable(bench, **ringing) as table:
             for index, (start_deg, target_deg) in enumerate(pairwise((table.rest_deg, *TARGETS_DEG))):

@@ -21,7 +21,6 @@ from calibration.procedure import (
     Measured,
     Procedure,
     lower_end,
-    require_at_least,
     returning,
 )
 from rig.bench import Bench
@@ -69,12 +68,9 @@ def plot(result: CalibrationResult) -> Chart | None:
 class Backlash(Procedure):
     """A procedure that measures the backlash by ``reversals`` of the table around its present angle."""
 
-    names, title, devices, valid_days, plots = (NAME,), "backlash of the gears", ("servo", "imu"), 90, (plot,)
+    result_name, devices, valid_days, plots = NAME, ("servo", "imu"), 90, (plot,)
     reference = "encoder of the servo"
     reversals: int
-
-    def __post_init__(self) -> None:
-        require_at_least(MIN_REVERSALS, self.reversals, "reversals")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         legs: list[Leg] = []
@@ -90,7 +86,7 @@ class Backlash(Procedure):
                     move = goto(base_deg + (length_deg if index % 2 == 0 else 0.0))
                     legs.append(Leg.of(move, bench.config.imu))
                     yield moved(2 + index, move)
-        yield evaluate(legs, resolution_deg=bench.servo.resolution_deg)
+        return evaluate(legs, resolution_deg=bench.servo.resolution_deg)
 
 
 def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:

@@ -21,7 +21,7 @@ HAND_DEG = 5.0
 class Cable(Procedure):
     """A procedure in which the operator shows both ends of the cable. The servo moves nothing."""
 
-    names, title, devices, valid_days = (NAME,), "ends of the cable", ("servo",), 365
+    result_name, devices, valid_days = NAME, ("servo",), 365
     reference = "encoder of the servo"
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
@@ -31,7 +31,7 @@ class Cable(Procedure):
             yield Ask(f"Rotate the table by hand {direction}, seen from above, until the cable is almost taut.")
             ends_deg.append(bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg))
         yield Ask("Rotate the table back by hand until the cable hangs free.")
-        yield evaluate(*ends_deg, pan=bench.config.table.mode == "pan")
+        return evaluate(*ends_deg, pan=bench.config.table.mode == "pan")
 
 
 def evaluate(high_deg: float, low_deg: float, *, pan: bool) -> Evaluation:

@@ -4,12 +4,14 @@ Zhang's method (OpenCV's calibrateCamera, model k1, k2, p1, p2), with the standa
 Jacobian at the solution, times the scatter of the residuals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.board_views import (
     STANDS,
@@ -44,14 +46,14 @@ ENLARGED = 100
 PARAMETERS = (("fx", "px"), ("fy", "px"), ("cx", "px"), ("cy", "px"), ("k1", ""), ("k2", ""), ("p1", ""), ("p2", ""))
 
 
-def matrix_of(result: CalibrationResult) -> tuple["np.ndarray[tuple[int, int], np.dtype[np.float64]]", list[float]]:
+def matrix_of(result: CalibrationResult) -> tuple[NDArray[np.float64], list[float]]:
     """Return the camera matrix (3, 3) and the distortion k1, k2, p1, p2 of a calibrated camera."""
     value = {name: estimate.value for name, estimate in result.estimates.items()}
     matrix = np.array([[value["fx"], 0.0, value["cx"]], [0.0, value["fy"], value["cy"]], [0.0, 0.0, 1.0]])
     return matrix, [value[name] for name in ("k1", "k2", "p1", "p2")]
 
 
-def covariance(result: CalibrationResult) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+def covariance(result: CalibrationResult) -> NDArray[np.float64]:
     """Return the covariance (8, 8) of the parameters: the stated uncertainties, and how the views correlate them.
 
     The views determine some combinations far better than each parameter: a principal point that is too low, with a
@@ -62,9 +64,7 @@ def covariance(result: CalibrationResult) -> "np.ndarray[tuple[int, int], np.dty
     board = CharucoBoard(**result.evidence["board"])
     normal = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     for view in result.evidence["views"]:
-        points_mm, corners = board.points_mm()[view["ids"]], np.array(view["corners_px"])
-        _, rotation, translation = cv2.solvePnP(points_mm, corners, matrix, np.array(distortion))
-        jacobian = cv2.projectPoints(points_mm, rotation, translation, matrix, np.array(distortion))[1]
+        _, jacobian = _projected(view, board, matrix, distortion)
         of_pose, of_camera = jacobian[:, :6], jacobian[:, 6 : 6 + len(PARAMETERS)]
         explained = of_pose @ np.linalg.lstsq(of_pose, of_camera, rcond=None)[0]
         normal += of_camera.T @ (of_camera - explained)
@@ -72,6 +72,16 @@ def covariance(result: CalibrationResult) -> "np.ndarray[tuple[int, int], np.dty
     stated = np.array([result.estimates[name].uncertainty for name, _ in PARAMETERS])
     scale = stated / np.sqrt(np.diag(inverse))
     return np.asarray(scale[:, None] * inverse * scale)
+
+
+def _projected(
+    view: Mapping[str, Any], board: CharucoBoard, matrix: NDArray[np.float64], distortion: Sequence[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the corners of a view where the camera sees them by the fit, (n, 2), and their derivatives, (2 n, ...)."""
+    points_mm, corners, lens = board.points_mm()[view["ids"]], np.array(view["corners_px"]), np.array(distortion)
+    _, rotation, translation = cv2.solvePnP(points_mm, corners, matrix, lens)
+    seen, jacobian = cv2.projectPoints(points_mm, rotation, translation, matrix, lens)
+    return np.asarray(seen, np.float64).reshape(-1, 2), np.asarray(jacobian, np.float64)
 
 
 def plot(result: CalibrationResult) -> Chart | None:
@@ -104,10 +114,8 @@ def plot_residuals(result: CalibrationResult) -> Chart | None:
     vectors = []
     for name, colour, of_stand in by_stand(views):
         for view in of_stand:
-            points_mm, corners = board.points_mm()[view["ids"]], np.array(view["corners_px"])
-            _, rotation, translation = cv2.solvePnP(points_mm, corners, matrix, np.array(distortion))
-            fitted = cv2.projectPoints(points_mm, rotation, translation, matrix, np.array(distortion))[0].reshape(-1, 2)
-            ends = corners + ENLARGED * (corners - fitted)
+            corners = np.array(view["corners_px"])
+            ends = corners + ENLARGED * (corners - _projected(view, board, matrix, distortion)[0])
             for x, y in np.stack([corners, ends], axis=2).tolist():
                 vectors.append(Series("", x, y, colour, dots=False, curve=True))
         vectors.append(Series(name, [], [], colour, dots=False, curve=True))
@@ -124,7 +132,7 @@ def plot_residuals(result: CalibrationResult) -> Chart | None:
 class CameraModel(Procedure):
     """A procedure that takes views of the board in four positions, from nine sides each."""
 
-    names, title, devices, valid_days = (NAME,), "lens of the camera", ("camera",), 365
+    result_name, devices, valid_days = NAME, ("camera",), 365
     reference = "ChArUco board, {board.columns} × {board.rows} squares of {board.square_mm:g} mm"
     plots = (plot, plot_residuals, partial(plot_views, limit_px=MAX_RMS_PX))
     board: CharucoBoard = field(default_factory=CharucoBoard)
@@ -133,7 +141,7 @@ class CameraModel(Procedure):
         found = Evaluation(name=NAME)
         views = yield from take_views(bench, self.board, STANDS, ANGLES_DEG, found)
         identity = bench.camera.identity
-        yield evaluate(views, self.board, (identity.width, identity.height), found)
+        return evaluate(views, self.board, (identity.width, identity.height), found)
 
 
 def evaluate(

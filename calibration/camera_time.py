@@ -146,7 +146,6 @@ class Fit:
     jitter_s: float
     jitter_sigma_s: float
     scatter_deg: float
-    rows_s: list[float]
     rate_dps: NDArray[np.float64]
     ahead_deg: NDArray[np.float64]
 
@@ -235,7 +234,6 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
         jitter_s,
         sqrt(noise) / (2 * jitter_s) if jitter_s > 1e-4 else sqrt(sqrt(noise)),
         sqrt(max(float(rest), 0.0)),
-        [float(value) + slope for value, slope in zip(times_s, slopes, strict=True)],
         rate,
         mean + values[0] * rate,
     )
@@ -263,7 +261,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 class CameraTime(Procedure):
     """A procedure that measures the camera's time by rotating an object at several speeds in both directions."""
 
-    names, title, devices, plots = (NAME,), "time of the frames", ("servo", "camera", "exposure"), (plot,)
+    result_name, devices, plots = NAME, ("servo", "camera", "exposure"), (plot,)
     reference = "encoder of the servo; clock of the computer"
     valid_days = 90
     """Three months, because time stamps depend on camera, driver, USB port and kernel."""
@@ -274,8 +272,7 @@ class CameraTime(Procedure):
         found = Evaluation(name=NAME, residual_unit="°", limit=MAX_ANGLE_DEG)
         config = bench.config
         if config.camera.exposure_us is None:
-            yield found.reject(RejectionCode.EXPOSURE_NOT_LOCKED)
-            return
+            return found.reject(RejectionCode.EXPOSURE_NOT_LOCKED)
         yield Ask(
             "Put the board upright in the middle of the platter, or any object with texture. Take your hands off.",
         )
@@ -298,8 +295,7 @@ class CameraTime(Procedure):
                 for way in (1, -1):
                     taken = _take_pass(table, flights, bench, ends_deg, speed, way)
                     if taken is None:
-                        yield found.reject(RejectionCode.STAMPS_UNUSABLE)
-                        return
+                        return found.reject(RejectionCode.STAMPS_UNUSABLE)
                     one, residual_deg, missing = taken
                     worst_deg, lost, frames = max(worst_deg, residual_deg), lost + missing, frames + len(one.angle_deg)
                     passes.append(one)
@@ -314,7 +310,7 @@ class CameraTime(Procedure):
             found.estimate(
                 "lost_frames", share, "", Contribution("chance in the number of lost frames", "A", sigma, "")
             )
-        yield found
+        return found
 
 
 def _ramp_deg(speed_dps: float, bench: Bench) -> float:
@@ -416,8 +412,6 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
         "rates_dps": np.round(times.rate_dps, 2).tolist(),
         "ahead_deg": np.round(times.ahead_deg, 4).tolist(),
         "stamp_to_middle_ms": middle_s * 1e3,
-        "rows": [round(0.5 + centre, 3) for _, centre in bands],
-        "rows_ms": [round(value * 1e3, 3) for value in times.rows_s],
         "exposure_ms": exposure_ms,
     }
     # Reject: first too little texture, then what a view in motion would suffer from.

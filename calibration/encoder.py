@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg
-from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
+from calibration.procedure import Evaluation, Measured, Procedure, returning, too_little_room
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
@@ -79,12 +79,9 @@ def plot(result: CalibrationResult) -> Chart | None:
 class Encoder(Procedure):
     """A procedure that measures the encoder's error over ``revolutions`` of the table, in even steps upwards."""
 
-    names, title, devices, valid_days, plots = (NAME,), "error of the encoder", ("servo", "imu"), 365, (plot,)
+    result_name, devices, valid_days, plots = NAME, ("servo", "imu"), 365, (plot,)
     reference = "whole revolutions of the platter, divided by the gyro"
     revolutions: int
-
-    def __post_init__(self) -> None:
-        require_at_least(MIN_REVOLUTIONS, self.revolutions, "revolutions")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         config, revolution_deg = bench.config.table, bench.servo.revolution_deg
@@ -112,7 +109,7 @@ class Encoder(Procedure):
                     steps.append(Step(before, after, raw))
                     yield moved(len(steps), move)
         resolution_deg = bench.servo.resolution_deg
-        yield evaluate(steps, direction=config.direction, revolution_deg=revolution_deg, resolution_deg=resolution_deg)
+        return evaluate(steps, direction=config.direction, revolution_deg=revolution_deg, resolution_deg=resolution_deg)
 
 
 def evaluate(steps: Sequence[Step], *, direction: int, revolution_deg: float, resolution_deg: float) -> Evaluation:

@@ -26,7 +26,6 @@ from calibration.procedure import (
     Measured,
     Procedure,
     lower_end,
-    require_at_least,
     returning,
 )
 from rig.bench import Bench
@@ -81,12 +80,9 @@ def plot(result: CalibrationResult) -> Chart | None:
 class GyroRotation(Procedure):
     """A procedure that rotates back and forth ``repeats`` times at each speed, around the table's present angle."""
 
-    names, title, devices, valid_days, plots = (NAME,), "scatter of rotations", ("servo", "imu"), 180, (plot,)
+    result_name, devices, valid_days, plots = NAME, ("servo", "imu"), 180, (plot,)
     reference = "encoder of the servo"
     repeats: int
-
-    def __post_init__(self) -> None:
-        require_at_least(MIN_REPEATS, self.repeats, "repeats")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         velocity_dps = bench.config.table.velocity_dps
@@ -102,7 +98,7 @@ class GyroRotation(Procedure):
                             moves.append(TimedLeg(speed, move.gyro.duration_s, Leg.of(move, bench.config.imu)))
                         yield moved(index, move)
                         index += 1
-        yield evaluate(moves, resolution_deg=bench.servo.resolution_deg)
+        return evaluate(moves, resolution_deg=bench.servo.resolution_deg)
 
 
 def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg
-from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
+from calibration.procedure import Evaluation, Measured, Procedure, returning, too_little_room
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
@@ -69,14 +69,11 @@ def plot(result: CalibrationResult) -> Chart | None:
 class GyroScale(Procedure):
     """A procedure that measures the gyro's scale by at least ``revolutions`` whole revolutions."""
 
-    names, title, devices, plots = (NAME,), "scale of the gyro", ("servo", "imu"), (plot,)
+    result_name, devices, plots = NAME, ("servo", "imu"), (plot,)
     reference = "whole revolutions of the servo's encoder"
     valid_days = 180
     """Half a year, to notice a loose sensor; the scale changes by mounting and temperature, not by use."""
     revolutions: int
-
-    def __post_init__(self) -> None:
-        require_at_least(2 * MIN_LEGS, self.revolutions, "revolutions")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         low_deg, high_deg = bench.config.table.limits_deg
@@ -97,7 +94,7 @@ class GyroScale(Procedure):
                 if index:  # the first rotation runs through the backlash
                     legs.append(Leg.of(move, bench.config.imu))
                 yield moved(index, move)
-        yield evaluate(legs, resolution_deg=bench.servo.resolution_deg)
+        return evaluate(legs, resolution_deg=bench.servo.resolution_deg)
 
 
 def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:

@@ -34,7 +34,7 @@ MAX_RESIDUAL_DEG = 3.0
 class HomeMark(Procedure):
     """A procedure that takes views of the card from eleven sides. Needs the camera's calibration."""
 
-    names, title, devices, valid_days = (NAME,), "home mark", ("camera", "servo"), 365
+    result_name, devices, valid_days = NAME, ("camera", "servo"), 365
     reference = "encoder of the servo; ChArUco card, {card.columns} × {card.rows} squares of {card.square_mm:g} mm"
     requires = (camera_model.NAME,)
     card: CharucoBoard
@@ -42,7 +42,7 @@ class HomeMark(Procedure):
     def measure(self, bench: Bench, *required: CalibrationResult) -> Measured:
         found = Evaluation(name=NAME)
         views = yield from take_views(bench, self.card, STAND, ANGLES_DEG, found)
-        yield evaluate(views, self.card, required[0], found)
+        return evaluate(views, self.card, required[0], found)
 
 
 def evaluate(

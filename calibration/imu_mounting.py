@@ -9,7 +9,7 @@ delay.
 
 from collections.abc import Generator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import degrees, hypot, radians, sqrt
 from typing import Any, cast
 
@@ -21,7 +21,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Contribution, Estimate, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.devices.imu import Imu, ImuSamples
-from rig.devices.servo import Servo, ServoState
+from rig.motion.traces import MoveTrace
 from rig.motion.turntable import Turntable
 from rig.plans.steps import moved
 
@@ -67,53 +67,19 @@ class GravityReading:
     sigma_g: float
 
 
-@dataclass(slots=True)
-class Recording:
-    """All readings, in order."""
+class _RecordedImu:
+    """An IMU that keeps the samples that are read from it."""
 
-    states: list[ServoState] = field(default_factory=list)
-    samples: list[ImuSamples] = field(default_factory=list)
-
-    def clear(self) -> None:
-        self.states.clear()
-        self.samples.clear()
-
-    def gyro(self) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
-        """Return the samples' times (n,), the rates (n, 3) in °/s, and the number of lost samples."""
-        if not self.samples:
-            return np.empty(0, np.int64), np.empty((0, 3)), 0
-        return (
-            np.concatenate([part.time_ns for part in self.samples]),
-            np.concatenate([part.gyro_dps for part in self.samples]),
-            sum(part.lost for part in self.samples),
-        )
-
-
-class _Tapped:
-    """A device that records the values of one of its readings."""
-
-    def __init__(self, device: Any, reading: str, kept: list[Any]) -> None:
-        self._device, self._reading, self._kept = device, reading, kept
+    def __init__(self, imu: Imu) -> None:
+        self._imu = imu
+        self.kept: list[ImuSamples] = []
 
     def __getattr__(self, name: str) -> Any:
-        attribute = getattr(self._device, name)
-        if name != self._reading:
-            return attribute
+        return getattr(self._imu, name)
 
-        def read() -> Any:
-            value = attribute()
-            self._kept.append(value)
-            return value
-
-        return read
-
-
-def recording(bench: Bench) -> tuple[Bench, Recording]:
-    """Return a bench on the same devices, for a `Turntable`, and what it reads from servo and IMU."""
-    kept, recorded = Recording(), copy(bench)
-    recorded.servo = cast(Servo, _Tapped(bench.servo, "read_state", kept.states))
-    recorded.imu = cast(Imu, _Tapped(bench.imu, "read_samples", kept.samples))
-    return recorded, kept
+    def read_samples(self) -> ImuSamples:
+        self.kept.append(self._imu.read_samples())
+        return self.kept[-1]
 
 
 def plot(result: CalibrationResult) -> Chart | None:
@@ -136,7 +102,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 class ImuMounting(Procedure):
     """A procedure that rotates the table once, in eight steps, and reads the sensor at each stop."""
 
-    names, title, devices, valid_days, plots = (NAME,), "mounting of the IMU", ("servo", "imu"), 180, (plot,)
+    result_name, devices, valid_days, plots = NAME, ("servo", "imu"), 180, (plot,)
     reference = "gravity, and the axis about which the table rotates; of the delay, encoder of the servo"
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
@@ -148,17 +114,19 @@ class ImuMounting(Procedure):
         column, sign = "xyz".index(config.imu.axis), config.imu.sign
         moves: list[RecordedMove] = []
         levels: list[GravityReading] = []
-        recorded_bench, kept = recording(bench)
+        # A turntable keeps the rate about one axis only; the tilt needs all three.
+        recorded_bench, imu = copy(bench), _RecordedImu(bench.imu)
+        recorded_bench.imu = cast(Imu, imu)
         with Turntable(recorded_bench) as table, returning(table) as goto:
             for index in range(STEPS + 1):
                 if index == 0:
                     yield moved(0, goto(first_deg))
                 else:
-                    kept.clear()
+                    imu.kept.clear()
                     _observe_rest(bench, table)
                     before_ns = bench.clock.now_ns()
                     move = goto(first_deg + index * 360.0 / STEPS)
-                    recorded = _recorded_move(kept, before_ns, column, sign, config.table.direction)
+                    recorded = _recorded_move(imu.kept, table.moves[-1], before_ns, column, sign)
                     if recorded is not None:
                         moves.append(recorded)
                     yield moved(index, move)
@@ -166,7 +134,7 @@ class ImuMounting(Procedure):
                     readings = np.array([bench.imu.read_gravity_g() for _ in _paced(bench, table)])
                     sigma = float(readings.std(axis=0, ddof=1).max()) / sqrt(READINGS)
                     levels.append(GravityReading(table.rest_deg, readings.mean(axis=0), sigma))
-        yield evaluate(moves, levels, column=column, sign=sign)
+        return evaluate(moves, levels, column=column, sign=sign)
 
 
 def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *, column: int, sign: int) -> Evaluation:
@@ -272,11 +240,14 @@ def _paced(bench: Bench, table: Turntable) -> Generator[None, None, None]:
             table.check_still()
 
 
-def _recorded_move(kept: Recording, before_ns: int, column: int, sign: int, direction: int) -> RecordedMove | None:
+def _recorded_move(
+    samples: Sequence[ImuSamples], trace: MoveTrace, before_ns: int, column: int, sign: int
+) -> RecordedMove | None:
     """Return the record of a rotation that began after ``before_ns``; None if samples were lost."""
-    times, rates, lost = kept.gyro()
-    if lost or not len(kept.states):
+    if not samples or any(part.lost for part in samples):
         return None
+    times = np.concatenate([part.time_ns for part in samples])
+    rates = np.concatenate([part.gyro_dps for part in samples])
     at_rest = times < before_ns
     moving = ~at_rest
     if at_rest.sum() < 50 or moving.sum() < 50:
@@ -287,13 +258,13 @@ def _recorded_move(kept: Recording, before_ns: int, column: int, sign: int, dire
     net = (rates[moving] - zero) * step_s
     angle = np.concatenate([[0.0], np.cumsum(net[:, column])]) * sign
     moments = np.concatenate([[times[moving][0] - round(step_s * 1e9)], times[moving]])
-    states = [state for state in kept.states if moments[0] <= state.time_ns <= moments[-1]]
-    state_ns = np.array([state.time_ns for state in states])
-    position = np.array([direction * state.position_deg for state in states])
-    gyro_deg = np.interp(state_ns, moments, angle)
-    rate_dps = np.interp(state_ns, times, (rates[:, column] - zero[column]) * sign)
-    start = np.mean([direction * state.position_deg for state in kept.states if state.time_ns < before_ns])
-    rotation = float(position[-1] - start)
+    readings = [(time_ns, deg) for time_ns, deg, *_ in trace.readings if moments[0] <= time_ns <= moments[-1]]
+    if not readings:
+        return None
+    reading_ns, position = np.array(readings).T
+    gyro_deg = np.interp(reading_ns, moments, angle)
+    rate_dps = np.interp(reading_ns, times, (rates[:, column] - zero[column]) * sign)
+    rotation = float(position[-1] - trace.from_deg)
     # The whole rotation gives the scale of the gyro relative to the encoder. The remaining difference during it is the
     # delay.
     scale = rotation / float(angle[-1]) if angle[-1] else 1.0
@@ -301,5 +272,5 @@ def _recorded_move(kept: Recording, before_ns: int, column: int, sign: int, dire
     span_s = float(moving.sum()) * step_s
     sigma = float(noise) * sqrt(step_s * span_s + (step_s * span_s**2) / (float(at_rest.sum()) * step_s))
     return RecordedMove(
-        rotation, net.sum(axis=0), sigma, (position - start - scale * gyro_deg)[cruising], rate_dps[cruising]
+        rotation, net.sum(axis=0), sigma, (position - trace.from_deg - scale * gyro_deg)[cruising], rate_dps[cruising]
     )

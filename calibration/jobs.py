@@ -65,8 +65,8 @@ def _titled(title: str = "") -> "Callable[[Callable[..., Sequence[Procedure]]], 
 
 @_titled("Servo (minutes)")
 def servo(
-    reversals: Annotated[int, typer.Option(help="Reversals for the backlash.")] = 24,
-    revolutions: Annotated[int, typer.Option(help="Revolutions for the encoder.")] = 2,
+    reversals: Annotated[int, typer.Option(min=6, help="Reversals for the backlash.")] = 24,
+    revolutions: Annotated[int, typer.Option(min=1, help="Revolutions for the encoder.")] = 2,
 ) -> "Sequence[Procedure]":
     """Calibrate direction, gear ratio, backlash and encoder of the servo.
 
@@ -92,8 +92,8 @@ def cable() -> "Sequence[Procedure]":
 
 @_titled("IMU (minutes)")
 def imu(
-    revolutions: Annotated[int, typer.Option(help="Least number of revolutions, both directions together.")] = 8,
-    repeats: Annotated[int, typer.Option(help="Repeated rotations at each speed, to verify σ.")] = 10,
+    revolutions: Annotated[int, typer.Option(min=4, help="Least number of revolutions, both directions together.")] = 8,
+    repeats: Annotated[int, typer.Option(min=4, help="Repeated rotations at each speed, to verify σ.")] = 10,
 ) -> "Sequence[Procedure]":
     """Calibrate scale and mounting of the gyro, and verify the uncertainty of rotations.
 
@@ -108,7 +108,7 @@ def imu(
 
 @_titled("Ringing of the platter")
 def shaper(
-    stops: Annotated[int, typer.Option(help="Stops after which the platter is listened to.")] = 10,
+    stops: Annotated[int, typer.Option(min=4, help="Stops after which the platter is listened to.")] = 10,
 ) -> "Sequence[Procedure]":
     """Calibrate how the platter rings after a stop; from then on, moves do not excite it. Put a usual object on it.
 
@@ -141,7 +141,7 @@ def table(
     lens_mm: LensMm = None,
     print_board: Annotated[
         Path | None,
-        typer.Option("--print-board", metavar="FILE", help="Write the board as .pdf or .png to print, and stop."),
+        typer.Option("--print-board", metavar="FILE", help="Write the board as .pdf to print, and stop."),
     ] = None,
 ) -> "Sequence[Procedure]":
     """Calibrate the position and the wobble of the table's axis in the camera's frame. Calibrate the camera first.

@@ -1,14 +1,14 @@
 """A calibration procedure: it measures on a bench, evaluates the data, and yields results.
 
-A procedure is a dataclass of its options. `Procedure.measure` moves the bench and yields events; each `Evaluation` that
-it yields becomes a dated `CalibrationResult`. The function ``evaluate`` of each module fits the data without a bench.
+A procedure is a dataclass of its options. `Procedure.measure` moves the bench, yields events, and returns an
+`Evaluation`, which becomes a dated `CalibrationResult`. The function ``evaluate`` of each module fits the data without
+a bench.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from datetime import datetime
 from typing import Any, ClassVar, Self
 
 from calibration.outcome import as_json, in_force, outcome_text
@@ -21,10 +21,9 @@ from rig.calibrations import (
     Estimate,
     RejectionCode,
 )
-from rig.calibrations.rejection import rejection
 from rig.catalog import log
 from rig.charts.xy import Chart
-from rig.core.errors import LimitExceeded, UsageError
+from rig.core.errors import LimitExceeded
 from rig.core.phrases import filled
 from rig.events.events import Event
 from rig.jobs.desk import Desk, JobResult, Progress, Remark, Steps
@@ -79,7 +78,9 @@ class Evaluation:
 
     def reject(self, code: RejectionCode, **values: Any) -> Self:
         """Add a rejection with the numbers that its words need, and return the evaluation."""
-        self.rejections.append(rejection(code, values))
+        # as Python numbers, because a result is compared with the one that is read from its file
+        plain = {key: value.item() if hasattr(value, "item") else value for key, value in values.items()}
+        self.rejections.append(CalibrationRejection(code, plain))
         return self
 
     def estimate(self, name: str, value: Any, unit: str, *budget: Contribution) -> Estimate:
@@ -87,10 +88,8 @@ class Evaluation:
         self.estimates[name] = found = Estimate(float(value), budget, unit)
         return found
 
-    def result(
-        self, *, when_utc: datetime, device: Any, reference: str, operator: str, valid_days: float | None = None
-    ) -> CalibrationResult:
-        """Return the dated result for a device."""
+    def result(self, *, device: Any = None, reference: str = "", operator: str = "", **when: Any) -> CalibrationResult:
+        """Return the dated result for a device; ``when`` are ``when_utc`` and ``valid_days`` of the result."""
         return CalibrationResult(
             name=self.name,
             estimates=self.estimates,
@@ -99,39 +98,36 @@ class Evaluation:
             residual_unit=self.residual_unit,
             rejections=tuple(self.rejections),
             settings=self.settings,
-            valid_days=valid_days,
-            when_utc=when_utc,
             reference=reference,
             operator=operator,
-            device=device,
+            device=device or {},
             evidence=self.evidence,
+            **when,
         )
 
 
-Measured = Generator[Event | Ask | Progress | Evaluation, None, None]
+Measured = Generator[Event | Ask | Progress, None, Evaluation]
 
 
 class Procedure(ABC):
     """A calibration procedure; subclasses are dataclasses of their options."""
 
-    names: ClassVar[tuple[str, ...]]
-    """The results that the procedure yields, in order."""
-    title: ClassVar[str]
-    """The quantity that it calibrates, in words."""
+    result_name: ClassVar[str]
+    """Name of the result."""
     reference: ClassVar[str]
     """What the quantity is compared with, in words: a template of the procedure's options."""
     devices: ClassVar[tuple[str, ...]]
-    """The devices that its results are bound to."""
+    """The devices that the result is bound to."""
     valid_days: ClassVar[float]
-    """Days for which its results are valid."""
+    """Days for which the result is valid."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Names of the results that must be in force; `measure` gets them in this order."""
     plots: ClassVar[Sequence[Plot]] = ()
-    """Functions that draw a result, the main plot first; they return None if there is nothing to draw."""
+    """Functions that draw the result, the main plot first; they return None if there is nothing to draw."""
 
     @abstractmethod
     def measure(self, bench: Bench, *required: CalibrationResult) -> Measured:
-        """Measure on the bench, and yield events and evaluations.
+        """Measure on the bench, yield events, and return the evaluation.
 
         Raises `UsageError`: an option is out of range; before anything moves. `LimitExceeded`: the cable leaves too
         little room; before anything moves. `ViewRejected`, `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see
@@ -141,21 +137,16 @@ class Procedure(ABC):
     def live(
         self, bench: Bench, *required: CalibrationResult
     ) -> Generator[Event | Ask | Progress | CalibrationResult, None, None]:
-        """Calibrate the bench: yield events, and each result when it is known. Raises what `measure` raises."""
-        when_utc, reference = bench.clock.utc(), filled(self.reference, **vars(self))
-        with closing(self.measure(bench, *required)) as events:
-            for event in events:
-                if isinstance(event, Evaluation):
-                    device = bench.apparatus(*self.devices)
-                    yield event.result(
-                        when_utc=when_utc,
-                        reference=reference,
-                        operator=log.operator(),
-                        device=device,
-                        valid_days=self.valid_days,
-                    )
-                else:
-                    yield event
+        """Calibrate the bench: yield events, and then the result. Raises what `measure` raises."""
+        when_utc = bench.clock.utc()
+        found = yield from self.measure(bench, *required)
+        yield found.result(
+            when_utc=when_utc,
+            reference=filled(self.reference, **vars(self)),
+            operator=log.operator(),
+            device=bench.apparatus(*self.devices),
+            valid_days=self.valid_days,
+        )
 
 
 def calibrated(desk: Desk, procedures: Sequence[Procedure]) -> Steps[bool]:
@@ -181,7 +172,7 @@ def calibrated(desk: Desk, procedures: Sequence[Procedure]) -> Steps[bool]:
 
 
 def _measured(desk: Desk, bench: Bench, store: CalibrationStore, procedure: Procedure) -> Steps[bool]:
-    """Run one procedure, and store its results up to the first that does not pass; return whether all passed."""
+    """Run one procedure, and store its result; return whether it passed."""
     required = [in_force(bench, name) for name in procedure.requires]
     with closing(procedure.live(bench, *required)) as steps:
         for step in steps:
@@ -222,12 +213,6 @@ def returning(table: Turntable) -> Iterator[Callable[[float], Move]]:
         go_back()
         raise
     go_back()
-
-
-def require_at_least(minimum: float, value: float, what: str) -> None:
-    """Raise `UsageError` if ``value`` is below ``minimum``."""
-    if value < minimum:
-        raise UsageError(f"{value:g} {what} are too few.", next_step=f"Give at least {minimum:g}.")
 
 
 def lower_end(bench: Bench, start_deg: float, length_deg: float) -> float:

@@ -71,11 +71,11 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class Repeatability(Procedure):
-    """A procedure that asks for the object ``name`` at its mark several times, and takes views from all sides."""
+    """A procedure that asks for the object ``thing`` at its mark several times, and takes views from all sides."""
 
-    names, title, devices, valid_days, plots = (NAME,), "repeatability of views", ("camera",), 180, (plot,)
-    reference = "other views of {name}"
-    name: str
+    result_name, devices, valid_days, plots = NAME, ("camera",), 180, (plot,)
+    reference = "other views of {thing}"
+    thing: str
     placements: int
     error_rate: float
 
@@ -97,10 +97,10 @@ class Repeatability(Procedure):
         for number in range(1, self.placements + 1):
             again = "again: take it off and put it back" if number > 1 else "as it stands when you enroll it"
             yield Ask(
-                f"Put {self.name} at its mark on the platter, {again} (placement {number} of {self.placements}). Take "
+                f"Put {self.thing} at its mark on the platter, {again} (placement {number} of {self.placements}). Take "
                 "your hands off.",
             )
-            bench.place(self.name)
+            bench.place(self.thing)
             rounds = []
             with Turntable(bench) as table:
                 # Two rounds of each placement show the noise without the placement.
@@ -121,8 +121,8 @@ class Repeatability(Procedure):
         found = evaluate(
             placements, error_rate=self.error_rate, views=identify.min_views, first_step_deg=identify.first_step_deg
         )
-        found.evidence["object"] = self.name
-        yield found
+        found.evidence["object"] = self.thing
+        return found
 
 
 def needed_placements(error_rate: float) -> int:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from calibration.procedure import Evaluation, Measured, Procedure, lower_end, require_at_least, returning
+from calibration.procedure import Evaluation, Measured, Procedure, lower_end, returning
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Contribution, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
@@ -99,12 +99,9 @@ def plot(result: CalibrationResult) -> Chart | None:
 class Ringing(Procedure):
     """A procedure that stops the table ``stops`` times, and listens to the platter."""
 
-    names, title, devices, valid_days, plots = (NAME,), "ringing of the platter", ("servo", "imu"), 180, (plot,)
+    result_name, devices, valid_days, plots = NAME, ("servo", "imu"), 180, (plot,)
     reference = "clock of the computer, by the times of the gyro's samples"
     stops: int
-
-    def __post_init__(self) -> None:
-        require_at_least(MIN_STOPS, self.stops, "stops")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         stops, held_deg = [], []
@@ -132,7 +129,7 @@ class Ringing(Procedure):
                 yield moved(index, move)
             goto(base_deg)
             bench.clock.sleep(LISTEN_S)
-        yield evaluate(stops, float(np.mean(held_deg)), creeps)
+        return evaluate(stops, float(np.mean(held_deg)), creeps)
 
 
 def _held_deg(creeps: Sequence[MoveTrace], lag_s: float) -> float | None:

@@ -135,7 +135,7 @@ class TableAxis(Procedure):
     Needs the camera's calibration.
     """
 
-    names, title, devices, valid_days = (NAME,), "axis of the table", ("camera", "servo"), 365
+    result_name, devices, valid_days = NAME, ("camera", "servo"), 365
     reference = "encoder of the servo; ChArUco board, {board.columns} × {board.rows} squares of {board.square_mm:g} mm"
     requires, plots = (camera_model.NAME,), (plot, partial(plot_views, limit_px=MAX_RMS_PX))
     board: CharucoBoard = field(default_factory=CharucoBoard)
@@ -156,7 +156,7 @@ class TableAxis(Procedure):
                 "(x, y, width, height)"
             )
             yield Progress(1.0, f"{words}; the frame cuts off {cut} of the space for them" if cut else words)
-        yield found
+        return found
 
 
 def evaluate(

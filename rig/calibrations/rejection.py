@@ -1,6 +1,5 @@
 """Reasons why a calibration did not pass: a code with its numbers, and its text for the operator."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, unique
 from typing import Annotated, Any
@@ -241,10 +240,3 @@ class CalibrationRejection:
             for key, value in self.values.items()
         }
         return filled(self.code.value, **shown)
-
-
-def rejection(code: RejectionCode, values: Mapping[str, Any]) -> CalibrationRejection:
-    """Return a rejection whose values are plain Python numbers."""
-    return CalibrationRejection(
-        code, {key: value.item() if hasattr(value, "item") else value for key, value in values.items()}
-    )

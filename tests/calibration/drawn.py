@@ -5,8 +5,27 @@ import numpy as np
 from calibration.gyro_rotation import SPEEDS, TimedLeg
 from calibration.imu_mounting import GravityReading, RecordedMove
 from calibration.legs import Leg
+from calibration.procedure import Evaluation
+from rig.calibrations import CalibrationResult, RejectionCode
 
 AXIS = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
+COUNT_DEG = 360 / 4096
+
+
+def codes(found: Evaluation | CalibrationResult) -> list[RejectionCode]:
+    """Return the codes of the rejections of a calibration."""
+    return [rejection.code for rejection in found.rejections]
+
+
+def in_sigmas(found: Evaluation | CalibrationResult, **truth: float) -> list[float]:
+    """Return the errors of some estimates, in their stated uncertainties."""
+    return [(found.estimates[name].value - true) / found.estimates[name].uncertainty for name, true in truth.items()]
+
+
+def rests(rng: np.random.Generator, stops_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rests anywhere within an encoder count of these angles, and what the encoder reads there."""
+    true_deg = stops_deg + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, len(stops_deg))
+    return true_deg, np.round(true_deg / COUNT_DEG) * COUNT_DEG
 
 
 def measured(

@@ -1,6 +1,7 @@
 """The home mark: its card shows the table's angle, and `rig home` needs only the revolution of the cable."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,18 +26,17 @@ def intrinsics(optics: Optics) -> CalibrationResult:
     found = Evaluation(name=camera_model.NAME)
     for name, value in zip(names, values, strict=True):
         found.estimate(name, value, 0.01)
-    return found.result(when_utc=SystemClock().utc(), reference="", operator="", device={})
+    return found.result(when_utc=SystemClock().utc())
 
 
-def measured(bench, optics: Optics) -> Evaluation:
-    *_, found = HomeMark(CARD).measure(bench, intrinsics(optics))
-    assert isinstance(found, Evaluation)
+def measured(s) -> CalibrationResult:
+    *_, found = HomeMark(CARD).live(s.bench, intrinsics(s.operator.optics))
     return found
 
 
 def test_card_shows_the_angle_from_all_sides_that_it_faces(simulated):
     s = simulated("camera.width=640", "camera.height=480", "view.roi=[80, 0, 480, 480]", seed=5)
-    found = measured(s.bench, s.operator.optics)
+    found = measured(s)
     assert found.passed, found.rejections
     assert abs(found.estimates["angle"].value) < 0.5
     mark = type(s.bench.config.mark)(**{key.removeprefix("mark."): value for key, value in found.settings.items()})
@@ -54,10 +54,7 @@ def test_card_shows_the_angle_from_all_sides_that_it_faces(simulated):
 def test_home_after_a_power_loss_needs_only_the_revolution(rig, tmp_path, simulated):
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\nstate_dir = "state"\ncalibration_dir = "calibrations"\n')
     s = simulated("camera.width=640", "camera.height=480", "view.roi=[80, 0, 480, 480]")
-    result = measured(s.bench, s.operator.optics).result(
-        when_utc=SystemClock().utc(), reference="", operator="", device={}, valid_days=365
-    )
-    CalibrationStore(Path("calibrations/sim")).add(result)
+    CalibrationStore(Path("calibrations/sim")).add(replace(measured(s), when_utc=SystemClock().utc()))
     rig("goto", "35")
     store = FileStore(Path("state/sim"))
     kept = store.load()
