@@ -5,18 +5,17 @@ That happens for one of n quarters of n pixels in grey frames, and for all quart
 multiples of 48.
 """
 
-import statistics
-import timeit
 from collections.abc import Callable
 
 import cv2
 import numpy as np
 
-from benchmarks.record import record
+from benchmarks.record import record, times_ms
 from hbr import cedd, describe
 from hbr.core.arrays import ImageArray
 
 REPEATS = 300
+PEER = "cv2.resize to 80 x 80"
 
 
 def frame(width: int, height: int) -> ImageArray:
@@ -30,13 +29,6 @@ def frame(width: int, height: int) -> ImageArray:
     return noisy
 
 
-def microseconds(function: Callable[[], object]) -> tuple[float, float]:
-    """Return minimum and median of the time of a call."""
-    function()
-    times = timeit.repeat(function, number=1, repeat=REPEATS)
-    return min(times) * 1e6, statistics.median(times) * 1e6
-
-
 def main() -> None:
     cv2.setNumThreads(1)
     for width, height in ((640, 480), (160, 160), (128, 128)):
@@ -44,17 +36,17 @@ def main() -> None:
         grey = image[:, :, 1:2].repeat(3, axis=2)
         flat = np.full_like(image, 127)
         posterised = (grey + np.random.default_rng(1).integers(0, 64, (height, width, 1), dtype=np.uint8)) // 48 * 48
-        peer = microseconds(lambda image=image: cv2.resize(image, (80, 80), interpolation=cv2.INTER_AREA))  # type: ignore[misc]
         calls: dict[str, Callable[[], object]] = {
+            PEER: lambda image=image: cv2.resize(image, (80, 80), interpolation=cv2.INTER_AREA),  # type: ignore[misc]
             "hbr.cedd": lambda image=image: cedd(image),  # type: ignore[misc]
             "hbr.cedd, grey": lambda grey=grey: cedd(grey),  # type: ignore[misc]
             "hbr.cedd, flat grey": lambda flat=flat: cedd(flat),  # type: ignore[misc]
             "hbr.cedd, noise in 6 greys": lambda posterised=posterised: cedd(posterised),  # type: ignore[misc]
             "hbr.describe": lambda image=image: describe(image),  # type: ignore[misc]
         }
-        rows = {"cv2.resize to 80 x 80, INTER_AREA": peer} | {name: microseconds(call) for name, call in calls.items()}
-        for name, (least, _) in rows.items():
-            record(f"{width}x{height}: {name}", least / 1e3, "cv2.resize to 80 x 80", peer[0] / 1e3)
+        least_ms = {name: min(times_ms(call, REPEATS)) for name, call in calls.items()}
+        for name, one_ms in least_ms.items():
+            record(f"{width}x{height}: {name}", one_ms, PEER, least_ms[PEER])
 
 
 if __name__ == "__main__":

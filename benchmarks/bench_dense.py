@@ -5,8 +5,6 @@ Times are processor times, minimum and median. Ratios are ratios of minima, beca
 
 import argparse
 import statistics
-import timeit
-from collections.abc import Callable
 from functools import partial
 from time import process_time
 
@@ -14,6 +12,7 @@ import cv2
 import numpy as np
 
 from benchmarks.bench_search import model, queries_of
+from benchmarks.record import times_ms
 from hbr import (
     Background,
     DenseIndex,
@@ -35,15 +34,6 @@ from hbr.paper.hmm import PoseBelief, PoseModel, update_poses
 #: The views of a search, as positions on an object's ring of 72.
 SEEN = (0, 18, 30, 45, 60, 66, 9, 51)
 REPEATS = 40
-
-
-def milliseconds(function: Callable[[int], object], repeats: int) -> list[float]:
-    """Return the time of each call."""
-    function(0)
-    return [
-        timeit.timeit(lambda i=i: function(i), timer=process_time, number=1) * 1e3  # type: ignore[misc]
-        for i in range(repeats)
-    ]
 
 
 def row(size: object, call: str, took_ms: list[float], peer_ms: list[float]) -> None:
@@ -81,7 +71,7 @@ def bench_step(objects: int) -> None:
             index._remembered.clear()
             retrieve(queries[:-1], angles[:-1], index)
             step = partial(lambda q, a: next_view(retrieve(q, a, index)), queries, angles)
-            ahbr.append(timeit.timeit(step, timer=process_time, number=1) * 1e3)
+            ahbr += times_ms(step, 1, process_time, first=False)
             hmm.append(_hmm_step_ms(poses, rows))
             for kind, views in kinds.items():
                 dense[kind].append(_step_ms(views, indices[kind], views.of(j)[list(SEEN[:n])]))
@@ -96,10 +86,8 @@ def _step_ms(views: Views, index: DenseIndex, rows: IndexArray) -> float:
     for i in rows[:-1].tolist():
         so_far = update_belief(views.descriptors[i], float(views.azimuth_deg[i]), so_far)
     last, angle_deg = views.descriptors[rows[-1]], float(views.azimuth_deg[rows[-1]])
-    step = partial(
-        lambda levels, deg, known: next_best_view(update_belief(levels, deg, known)), last, angle_deg, so_far
-    )
-    return timeit.timeit(step, timer=process_time, number=1) * 1e3
+    (took_ms,) = times_ms(lambda: next_best_view(update_belief(last, angle_deg, so_far)), 1, process_time, first=False)
+    return took_ms
 
 
 def _hmm_step_ms(model: PoseModel, rows: IndexArray) -> float:
@@ -110,15 +98,16 @@ def _hmm_step_ms(model: PoseModel, rows: IndexArray) -> float:
     so_far: PoseModel | PoseBelief = model
     for row in rows[:-1].tolist():
         so_far = after(row, so_far)
-    return timeit.timeit(lambda: after(rows[-1], so_far).next_view(), timer=process_time, number=1) * 1e3
+    (took_ms,) = times_ms(lambda: after(rows[-1], so_far).next_view(), 1, process_time, first=False)
+    return took_ms
 
 
 def bench_describe(name: str, frame: ImageArray, empty: ImageArray | None) -> None:
     """Measure the segmentation, and each descriptor of the object."""
     background = None if empty is None else Background(empty)
-    plain = milliseconds(lambda _: descriptor("cedd").describe(frame), REPEATS)
+    plain = times_ms(lambda: descriptor("cedd").describe(frame), REPEATS, process_time)
     row(name, "cedd of the whole frame (= 1)", plain, plain)
-    found = milliseconds(lambda _: segment(frame, empty_table=background), REPEATS)
+    found = times_ms(lambda: segment(frame, empty_table=background), REPEATS, process_time)
     row(name, "segmentation", found, plain)
     seen = segment(frame, empty_table=background)
 
@@ -130,7 +119,7 @@ def bench_describe(name: str, frame: ImageArray, empty: ImageArray | None) -> No
         return descriptor(kind).describe(seen)
 
     for kind in [name for name in names()[1:] if descriptor(name).can_describe]:
-        took = milliseconds(lambda _, kind=kind: describe(kind), REPEATS)  # type: ignore[misc]
+        took = times_ms(partial(describe, kind), REPEATS, process_time)
         row(name, f"{kind} of the object, {descriptor(kind).size_bytes} bytes", took, plain)
 
 

@@ -5,12 +5,10 @@ program on.
 """
 
 import argparse
-import timeit
-from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.record import record
+from benchmarks.record import record, times_ms
 from hbr import DenseIndex, DenseSession, PackedViews
 from hbr.core.arrays import LevelArray
 from hbr.descriptors import descriptor
@@ -41,11 +39,6 @@ def packed_views(objects: int) -> LevelArray:
     return packed.reshape(-1, packed.shape[2])
 
 
-def milliseconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
-    function()
-    return min(timeit.repeat(function, number=1, repeat=repeats)) * 1e3
-
-
 def bench(objects: int) -> None:
     """Measure the steps of a search among this number of objects."""
     packed = packed_views(objects)
@@ -58,7 +51,7 @@ def bench(objects: int) -> None:
     )
     words = packed.ravel().view(np.uint64)
     peer = "reading the packed views"
-    read_ms = milliseconds(words.max)
+    read_ms = min(times_ms(words.max, REPEATS))
     first, second = views.levels(np.array([100, 118]))
     index = DenseIndex(views)
 
@@ -72,14 +65,14 @@ def bench(objects: int) -> None:
 
     name = f"{len(views):,} views"
     record(f"{name}: reading", read_ms, peer, read_ms)
-    record(f"{name}: preparing the index", milliseconds(lambda: DenseIndex(views), 3), peer, read_ms)
-    one_ms, both_ms = milliseconds(lambda: steps(1)), milliseconds(lambda: steps(2))
+    record(f"{name}: preparing the index", min(times_ms(lambda: DenseIndex(views), 3)), peer, read_ms)
+    one_ms, both_ms = (min(times_ms(lambda n=n: steps(n), REPEATS)) for n in (1, 2))  # type: ignore[misc]
     record(f"{name}: first step with decision and next view", one_ms, peer, read_ms)
     record(f"{name}: later step with decision and next view", both_ms - one_ms, peer, read_ms)
     if objects <= 1_000:
         with without_library():
             index = DenseIndex(views)
-            numpy_ms = milliseconds(lambda: steps(2), 3)
+            numpy_ms = min(times_ms(lambda: steps(2), 3))
         record(f"{name}: two steps, compiled", both_ms, "the same in NumPy", numpy_ms)
 
 

@@ -4,9 +4,11 @@ import argparse
 import statistics
 import timeit
 from collections.abc import Callable, Sequence
+from itertools import count
 
 import numpy as np
 
+from benchmarks.record import times_ms
 from hbr import ViewIndex, Views, next_view, retrieve
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.paper.index import Method
@@ -47,8 +49,8 @@ def queries_of(views: Views, rows: IndexArray, seed: int) -> LevelArray:
 
 def milliseconds(function: Callable[[int], object], repeats: int) -> float:
     """Return the median time of a call, over different arguments."""
-    function(0)
-    return statistics.median(timeit.timeit(lambda i=i: function(i), number=1) for i in range(repeats)) * 1e3  # type: ignore[misc]
+    number = count()
+    return statistics.median(times_ms(lambda: function(next(number)), repeats))
 
 
 def product_ms(views: Views, queries: LevelArray, repeats: int) -> tuple[float, float]:
@@ -67,13 +69,6 @@ def product_ms(views: Views, queries: LevelArray, repeats: int) -> tuple[float, 
     return milliseconds(lambda i: as_float @ as_queries[i % QUERIES], repeats), milliseconds(scan, repeats)
 
 
-def built(views: Views, method: Method = "flat") -> ViewIndex:
-    """Return an index that has searched once, because an index is built by its first search."""
-    index = ViewIndex(views, method)
-    index.search(views.descriptors[0], K)
-    return index
-
-
 def bench_search(views: Views, methods: Sequence[Method], repeats: int) -> None:
     """Measure search and construction with every method."""
     queries = queries_of(views, np.random.default_rng(1).integers(len(views), size=QUERIES), 2)
@@ -82,7 +77,8 @@ def bench_search(views: Views, methods: Sequence[Method], repeats: int) -> None:
     print(f"{len(views):>9} {'numpy float32 product, argpartition (= 1)':<44} {scanned:9.3f} {1:6.2f}")
     for method in methods:
         begun = timeit.default_timer()
-        index = built(views, method)
+        index = ViewIndex(views, method)
+        index.search(views.descriptors[0], K)  # builds it
         build_s = timeit.default_timer() - begun
 
         def search(i: int, index: ViewIndex = index) -> object:
@@ -107,11 +103,11 @@ def step_ms(views: Views, index: ViewIndex, repeats: int) -> tuple[float, float]
             return next_view(retrieve(seen, angles_deg, index))
 
         index._remembered.clear()
-        at_once.append(timeit.timeit(step, number=1))
+        at_once += times_ms(step, 1, first=False)
         index._remembered.clear()
         retrieve(seen[:-1], angles_deg[:-1], index)
-        after.append(timeit.timeit(step, number=1))
-    return statistics.median(after) * 1e3, statistics.median(at_once) * 1e3
+        after += times_ms(step, 1, first=False)
+    return statistics.median(after), statistics.median(at_once)
 
 
 def bench_step(views: Views, repeats: int) -> None:

@@ -15,7 +15,7 @@ from time import process_time, thread_time
 import cv2
 import numpy as np
 
-from benchmarks.record import record
+from benchmarks.record import record, times_ms
 from hbr import Background, Segmentation, ViewsTogether, descriptor, segment
 from hbr.core.arrays import ImageArray
 from hbr.drawing.bench import HARD, DrawnBench, Visit
@@ -46,17 +46,6 @@ def frames(seed: int) -> tuple[list[ImageArray], ImageArray]:
     return [printed_box(visit, side) for side in range(VIEWS)], visit.empty()
 
 
-def fastest(work: Callable[[], object], repeats: int) -> float:
-    """Return the shortest CPU time of a call in milliseconds."""
-    work()
-    took = []
-    for _ in range(repeats):
-        start = thread_time()
-        work()
-        took.append(thread_time() - start)
-    return 1e3 * min(took)
-
-
 def one_view(size: tuple[int, int]) -> None:
     """Measure one view of this width and height, and its parts."""
     images, empty = frames(0)
@@ -71,7 +60,7 @@ def one_view(size: tuple[int, int]) -> None:
         for each in kinds:
             each.describe(image if each.whole_image else view)
 
-    peer = fastest(lambda: cv2.resize(image, (80, 80), interpolation=cv2.INTER_AREA), 200)
+    peer = min(times_ms(lambda: cv2.resize(image, (80, 80), interpolation=cv2.INTER_AREA), 200, thread_time))
     parts: dict[str, tuple[Callable[[], object], int]] = {
         "whole view": (lambda: described(segment(image, empty_table=table)), 200),
         "- shrink the frame": (lambda: shrunk(image), 200),
@@ -83,7 +72,7 @@ def one_view(size: tuple[int, int]) -> None:
         "network": (lambda: shares(small), 30),
     }
     for name, (work, repeats) in parts.items():
-        record(f"{size[0]}x{size[1]}: {name}", fastest(work, repeats), "cv2.resize to 80 x 80", peer)
+        record(f"{size[0]}x{size[1]}: {name}", min(times_ms(work, repeats, thread_time)), "cv2.resize to 80 x 80", peer)
 
 
 def main() -> None:

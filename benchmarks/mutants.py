@@ -41,52 +41,40 @@ class _Place(ast.NodeTransformer):
         self.count = 0
         self.line = 0
 
-    def _is_wanted(self, node: ast.AST) -> bool:
+    def visit(self, node: ast.AST) -> ast.AST:
+        match node:
+            case ast.AnnAssign(value=ast.AST()):  # an annotation computes nothing
+                node.value = self.visit(node.value)
+            case ast.arguments():
+                node.defaults = [self.visit(one) for one in node.defaults]
+            case _:
+                self.generic_visit(node)
+        mutant = _mutant(node)
+        if mutant is None:
+            return node
         self.count += 1
         if self.count - 1 != self.wanted:
-            return False
+            return node
         self.line = node.lineno  # type: ignore[attr-defined]
-        return True
+        return mutant
 
-    def visit_Compare(self, node: ast.Compare) -> ast.AST:
-        self.generic_visit(node)
-        if type(node.ops[0]) in OPERATORS and self._is_wanted(node):
-            node.ops[0] = OPERATORS[type(node.ops[0])]()
-        return node
 
-    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
-        self.generic_visit(node)
-        if type(node.op) in OPERATORS and self._is_wanted(node):
-            node.op = OPERATORS[type(node.op)]()
-        return node
-
-    def visit_BoolOp(self, node: ast.BoolOp) -> ast.AST:
-        self.generic_visit(node)
-        if self._is_wanted(node):
-            node.op = OPERATORS[type(node.op)]()
-        return node
-
-    def visit_If(self, node: ast.If) -> ast.AST:
-        self.generic_visit(node)
-        if self._is_wanted(node):
-            node.test = ast.UnaryOp(ast.Not(), node.test)
-        return node
-
-    def visit_Constant(self, node: ast.Constant) -> ast.AST:
-        if isinstance(node.value, int | float) and not isinstance(node.value, bool) and self._is_wanted(node):
-            return ast.Constant(node.value + 1)
-        if isinstance(node.value, bool) and self._is_wanted(node):
-            return ast.Constant(not node.value)
-        return node
-
-    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
-        if node.value is not None:
-            node.value = self.visit(node.value)
-        return node
-
-    def visit_arguments(self, node: ast.arguments) -> ast.AST:
-        node.defaults = [self.visit(one) for one in node.defaults]
-        return node
+def _mutant(node: ast.AST) -> ast.AST | None:
+    """Return a node with one small mistake; None if there is none for nodes of its kind."""
+    match node:
+        case ast.Compare(left=left, ops=[first, *others], comparators=right) if type(first) in OPERATORS:
+            return ast.copy_location(ast.Compare(left, [OPERATORS[type(first)](), *others], right), node)
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
+            return ast.copy_location(ast.BinOp(left, OPERATORS[type(op)](), right), node)
+        case ast.BoolOp(op=op, values=values):
+            return ast.copy_location(ast.BoolOp(OPERATORS[type(op)](), values), node)
+        case ast.If(test=test, body=body, orelse=orelse):
+            return ast.copy_location(ast.If(ast.UnaryOp(ast.Not(), test), body, orelse), node)
+        case ast.Constant(value=bool(value)):
+            return ast.copy_location(ast.Constant(not value), node)
+        case ast.Constant(value=int(value) | float(value)):
+            return ast.copy_location(ast.Constant(value + 1), node)
+    return None
 
 
 def places(room: str) -> Iterator[tuple[str, int]]:

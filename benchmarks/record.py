@@ -1,10 +1,21 @@
 """The results of benchmarks in one file, ``bench.json``: ratios to a named peer, which hold on other computers, too."""
 
 import json
+import timeit
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 PATH: Final = Path("bench.json")
+
+
+def times_ms(
+    work: Callable[[], object], repeats: int, timer: Callable[[], float] = timeit.default_timer, *, first: bool = True
+) -> list[float]:
+    """Return the time of each call in milliseconds; ``first``: after a call that fills the caches."""
+    if first:
+        work()
+    return [1e3 * seconds for seconds in timeit.repeat(work, number=1, repeat=repeats, timer=timer)]
 
 
 def record(name: str, took_ms: float, peer: str, peer_ms: float) -> None:

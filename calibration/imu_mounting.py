@@ -21,7 +21,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Contribution, Estimate, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.devices.imu import Imu, ImuSamples
-from rig.motion.traces import MoveTrace
+from rig.devices.servo import Servo, ServoState
 from rig.motion.turntable import Turntable
 from rig.plans.steps import moved
 
@@ -67,19 +67,23 @@ class GravityReading:
     sigma_g: float
 
 
-class _RecordedImu:
-    """An IMU that keeps the samples that are read from it."""
+class _Tapped:
+    """A device that records the values of one of its readings."""
 
-    def __init__(self, imu: Imu) -> None:
-        self._imu = imu
-        self.kept: list[ImuSamples] = []
+    def __init__(self, device: Any, reading: str, kept: list[Any]) -> None:
+        self._device, self._reading, self._kept = device, reading, kept
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._imu, name)
+        attribute = getattr(self._device, name)
+        if name != self._reading:
+            return attribute
 
-    def read_samples(self) -> ImuSamples:
-        self.kept.append(self._imu.read_samples())
-        return self.kept[-1]
+        def read() -> Any:
+            value = attribute()
+            self._kept.append(value)
+            return value
+
+        return read
 
 
 def plot(result: CalibrationResult) -> Chart | None:
@@ -114,19 +118,23 @@ class ImuMounting(Procedure):
         column, sign = "xyz".index(config.imu.axis), config.imu.sign
         moves: list[RecordedMove] = []
         levels: list[GravityReading] = []
-        # A turntable keeps the rate about one axis only; the tilt needs all three.
-        recorded_bench, imu = copy(bench), _RecordedImu(bench.imu)
-        recorded_bench.imu = cast(Imu, imu)
+        # A turntable keeps the rate about its own axis only: record all that it reads.
+        states: list[ServoState] = []
+        samples: list[ImuSamples] = []
+        recorded_bench = copy(bench)
+        recorded_bench.servo = cast(Servo, _Tapped(bench.servo, "read_state", states))
+        recorded_bench.imu = cast(Imu, _Tapped(bench.imu, "read_samples", samples))
         with Turntable(recorded_bench) as table, returning(table) as goto:
             for index in range(STEPS + 1):
                 if index == 0:
                     yield moved(0, goto(first_deg))
                 else:
-                    imu.kept.clear()
+                    states.clear()
+                    samples.clear()
                     _observe_rest(bench, table)
                     before_ns = bench.clock.now_ns()
                     move = goto(first_deg + index * 360.0 / STEPS)
-                    recorded = _recorded_move(imu.kept, table.moves[-1], before_ns, column, sign)
+                    recorded = _recorded_move(states, samples, before_ns, column, sign, config.table.direction)
                     if recorded is not None:
                         moves.append(recorded)
                     yield moved(index, move)
@@ -241,10 +249,10 @@ def _paced(bench: Bench, table: Turntable) -> Generator[None, None, None]:
 
 
 def _recorded_move(
-    samples: Sequence[ImuSamples], trace: MoveTrace, before_ns: int, column: int, sign: int
+    states: Sequence[ServoState], samples: Sequence[ImuSamples], before_ns: int, column: int, sign: int, direction: int
 ) -> RecordedMove | None:
     """Return the record of a rotation that began after ``before_ns``; None if samples were lost."""
-    if not samples or any(part.lost for part in samples):
+    if not states or not samples or any(part.lost for part in samples):
         return None
     times = np.concatenate([part.time_ns for part in samples])
     rates = np.concatenate([part.gyro_dps for part in samples])
@@ -258,13 +266,13 @@ def _recorded_move(
     net = (rates[moving] - zero) * step_s
     angle = np.concatenate([[0.0], np.cumsum(net[:, column])]) * sign
     moments = np.concatenate([[times[moving][0] - round(step_s * 1e9)], times[moving]])
-    readings = [(time_ns, deg) for time_ns, deg, *_ in trace.readings if moments[0] <= time_ns <= moments[-1]]
-    if not readings:
-        return None
-    reading_ns, position = np.array(readings).T
-    gyro_deg = np.interp(reading_ns, moments, angle)
-    rate_dps = np.interp(reading_ns, times, (rates[:, column] - zero[column]) * sign)
-    rotation = float(position[-1] - trace.from_deg)
+    during = [state for state in states if moments[0] <= state.time_ns <= moments[-1]]
+    state_ns = np.array([state.time_ns for state in during])
+    position = np.array([direction * state.position_deg for state in during])
+    gyro_deg = np.interp(state_ns, moments, angle)
+    rate_dps = np.interp(state_ns, times, (rates[:, column] - zero[column]) * sign)
+    start = np.mean([direction * state.position_deg for state in states if state.time_ns < before_ns])
+    rotation = float(position[-1] - start)
     # The whole rotation gives the scale of the gyro relative to the encoder. The remaining difference during it is the
     # delay.
     scale = rotation / float(angle[-1]) if angle[-1] else 1.0
@@ -272,5 +280,5 @@ def _recorded_move(
     span_s = float(moving.sum()) * step_s
     sigma = float(noise) * sqrt(step_s * span_s + (step_s * span_s**2) / (float(at_rest.sum()) * step_s))
     return RecordedMove(
-        rotation, net.sum(axis=0), sigma, (position - trace.from_deg - scale * gyro_deg)[cruising], rate_dps[cruising]
+        rotation, net.sum(axis=0), sigma, (position - start - scale * gyro_deg)[cruising], rate_dps[cruising]
     )
