@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
-from rig.core.next_steps import Do, NextStep, SomeSteps
+from rig.core.next_steps import Do, SomeSteps
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.v4l2 import choose_mode
 from rig.doctor.examination import DoctorContext
@@ -28,9 +28,8 @@ QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
 """Largest time from the start of an exposure until the program has the frame; the table waits for it at each view."""
-EXPOSURE_STEP_US = 100.0
-"""Cameras round exposure times to this step."""
-MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
+STRIPS = 24  # a readout of 67 ms, a long one, shows 8 bands of a lamp at 60 Hz mains: three strips show each
+MAX_FLICKER = 0.05  # largest spread of the level of a strip in frames of one scene
 
 
 def camera(context: DoctorContext) -> Iterator[Finding]:
@@ -126,7 +125,6 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
 def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     clock = context.computer.clock
     frames: list[NDArray[np.uint8]] = []
-    times_ns = []
     ages = []
     # First frames as fast as they come, for the rate; then frames apart, for changes of the light.
     after_ns = start_ns = clock.now_ns()
@@ -135,7 +133,6 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         frame = source.capture(after_ns)
         ages.append(seconds_between(frame.exposed_ns, clock.now_ns()))
         frames.append(frame.image_bgr)
-        times_ns.append(frame.exposed_ns)
         if number == QUICK - 1:
             rate = QUICK / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
@@ -159,7 +156,17 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         yield warning("few_frames", f"{text}, not {{fps:.3g}}", fix, fps=source.identity.fps, **evidence)
     else:
         yield fine("frames", text, **evidence)
-    yield from _flicker(source, frames, np.array(times_ns), evidence)
+    # A rolling shutter shows a lamp at the mains as bands that move from image to image, so each strip counts alone.
+    strips = np.array([[part.mean() for part in np.array_split(frame, STRIPS)] for frame in frames])
+    spread = float(np.ptp(strips, axis=0).max() / strips.mean())
+    if spread > MAX_FLICKER:
+        text = "the light changes by {spread:.0%} within {seconds:.0f} s"
+        fix = (
+            "Lamps flicker with the mains: set camera.exposure_us to whole periods of the lamp, 10000 at 50 Hz or 8333 "
+            "at 60 Hz. Keep daylight and shadows away, then",
+            Do.DOCTOR(),
+        )
+        yield warning("flicker", text, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
     # Would an enrollment accept this view?
     quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
@@ -176,95 +183,3 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
             "{saturated_share:.1%} saturated"
         )
         yield fine("view_accepted", text, **quality)
-
-
-# -- lamps that flicker with the mains: the bands that they leave in the images of a rolling shutter -------------------
-
-MAINS_HZ = (50.0, 60.0)  # a lamp flickers at twice this rate
-MIN_DEPTH = 0.01
-"""Smallest amplitude, as a share of the mean level, that counts."""
-_MIN_EXPLAINED = 0.6  # less: something else changes the light, such as a person who passes
-_STANDS = 0.1
-"""Variance of the lamp's phase from image to image below which bands stand still; 1 if all phases occur."""
-_CYCLES = np.arange(0.0, 8.01, 0.125)
-"""Bands in an image: at most 8, for a readout of 67 ms at 120 Hz."""
-_BLOCKS = 48  # six for each band at most; more blocks are noisier
-
-
-def whole_periods_us(mains_hz: float, wanted_us: float) -> float:
-    """Return the exposure time without bands that is nearest to ``wanted_us``: whole periods of the lamp."""
-    period_us = 1e6 / (2 * mains_hz)
-    return float(round(max(round(wanted_us / period_us), 1) * period_us))
-
-
-def mains_flicker(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64]) -> tuple[float, float] | None:
-    """Return the mains frequency, in Hz, with which the light of a still scene flickers, and the depth of the bands.
-
-    The depth is their amplitude as a share of the mean level. None if there are no bands.
-
-    The row at the share y of the height is exposed later by y times the readout. So a lamp with the frequency f adds
-    cos(2π (f t + c y)) to the image at time t, with c bands. Both are fitted to the changes of each row. Bands that
-    stand still, because f is a multiple of the frame rate, cannot be told from the scene: see `standing_mains_hz`.
-
-    ``row_levels``, float64 (n, H), is the mean level of each row of n images at ``times_ns``, int64 (n,).
-    """
-    count, height = row_levels.shape
-    if count < 4 or height < _BLOCKS:
-        return None
-    blocks = row_levels[:, : height - height % _BLOCKS].reshape(count, _BLOCKS, -1).mean(axis=-1)
-    changes = blocks / np.maximum(blocks.mean(axis=0), 1.0) - 1.0
-    power = float((changes**2).mean())
-    if power == 0.0:
-        return None
-    bands = np.exp(-2j * np.pi * np.outer((np.arange(_BLOCKS) + 0.5) / _BLOCKS, _CYCLES))
-    depth, found_hz = 0.0, 0.0
-    for mains_hz in MAINS_HZ:
-        phases = _phases(mains_hz, times_ns)
-        if (weight := float((np.abs(phases) ** 2).mean())) >= _STANDS:
-            fitted = np.abs(phases @ changes @ bands).max() / (count * _BLOCKS * weight)
-            depth, found_hz = max((depth, found_hz), (2 * float(fitted), mains_hz))
-    return (found_hz, depth) if depth >= MIN_DEPTH and depth**2 / 2 / power >= _MIN_EXPLAINED else None
-
-
-def standing_mains_hz(times_ns: NDArray[np.int64]) -> tuple[float, ...]:
-    """Return the mains frequencies whose bands stand still in images of these times, int64 (n,)."""
-    return tuple(hz for hz in MAINS_HZ if (np.abs(_phases(hz, times_ns)) ** 2).mean() < _STANDS)
-
-
-def _phases(mains_hz: float, times_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
-    """Return the lamp's phase in each image as a complex number, without the mean, which is part of the scene."""
-    phases = np.exp(-2j * np.pi * 2 * mains_hz * (times_ns - times_ns[0]) * 1e-9)
-    return np.asarray(phases - phases.mean())
-
-
-def _flicker(
-    source: OpenCvCamera,
-    frames: list[NDArray[np.uint8]],
-    times_ns: NDArray[np.int64],
-    evidence: dict[str, Any],
-) -> Iterator[Finding]:
-    levels = evidence["mean_levels"]
-    spread = (max(levels) - min(levels)) / max(levels)
-    # Every second column of the green channel is enough for the levels of rows.
-    lamp = mains_flicker(np.array([frame[:, ::2, 1].mean(axis=1) for frame in frames]), times_ns)
-    reported_us = source.read_locks().exposure_us
-    exposure_us = reported_us or 1e4
-    # Whole periods of the lamp give each row the same light.
-    none = "an exposure of whole periods of the lamp has none"
-    if lamp is not None:
-        text = f"the lamps flicker with the mains ({{mains_hz:.0f}} Hz): bands of {{depth:.0%}} in the images; {none}"
-        mains_hz, depth = lamp
-        yield warning("mains_flicker", text, _set_exposure(mains_hz, exposure_us), mains_hz=mains_hz, depth=depth)
-    elif spread > MAX_FLICKER:
-        text = "the light changes by {spread:.0%} within {seconds:.0f} s"
-        fix = ("Use a lamp that does not flicker, and keep daylight and shadows away, then", Do.DOCTOR())
-        yield warning("flicker", text, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
-    else:
-        text = "bands of lamps at {mains_hz:.0f} Hz mains would stand still in the images, and are not checked; " + none
-        for hz in standing_mains_hz(times_ns):
-            if reported_us is None or abs(whole_periods_us(hz, exposure_us) - exposure_us) > EXPOSURE_STEP_US:
-                yield fine("standing_flicker_not_checked", text, _set_exposure(hz, exposure_us), mains_hz=hz)
-
-
-def _set_exposure(mains_hz: float, exposure_us: float) -> NextStep:
-    return Do.SET_KEY(key="camera.exposure_us", value=f"{whole_periods_us(mains_hz, exposure_us):g}")

@@ -1,7 +1,7 @@
 """Check the computer: the bench's state, ports and permissions, disk and clock."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -59,10 +59,10 @@ def ports(context: DoctorContext) -> Iterator[Finding]:
     """Check the servo's serial port, the IMU's bus and the camera's device file: present, permitted, free, fast."""
     config, computer = context.config, context.computer
     head = config.imu.connection == "head"
-    for key, wanted in (("servo.port", config.servo.port), ("head.port", config.head.port))[: 1 + head]:
+    for wanted in (config.servo.port, config.head.port)[: 1 + head]:
         port = computer.serial_port(wanted)
         if port is None:
-            yield _no_serial_port(context, key, wanted)
+            yield _no_serial_port(context, wanted)
             continue
         found = access(context, port, "dialout")
         yield found
@@ -73,42 +73,33 @@ def ports(context: DoctorContext) -> Iterator[Finding]:
             yield _latency(context, port)
     if not head:
         bus = computer.i2c_name(config.imu.bus)
-        buses = computer.i2c_buses(bus)
-        number = buses[0].path.removeprefix("/dev/i2c-") if buses else ""
-        enable = Do.SET_KEY(key="imu.bus", value=number) if buses else i2c_command(context)
-        yield _device_file(context, "no_i2c_bus", "I2C bus", bus, buses, "i2c", enable)
+        yield _device_file(context, "I2C bus", bus, computer.i2c_buses(bus), "i2c", i2c_command(context))
     camera = camera_node(config.camera.source)
     if camera is not None:  # else it is a file or a stream
-        nodes = computer.cameras()
-        connect: SomeSteps = ("Connect the camera, then", Do.FIND())
-        if nodes:
-            connect = Do.SET_KEY(key="camera.source", value=nodes[0].stable or nodes[0].path)
-        yield _device_file(context, "no_camera_device", "camera", camera, nodes, "video", connect)
+        connect = ("Connect the camera, then", Do.FIND())
+        yield _device_file(context, "camera", camera, computer.cameras(), "video", connect)
 
 
 def _device_file(
-    context: DoctorContext, code: str, kind: str, wanted: str, nodes: list[DeviceFile], group: str, fix: SomeSteps
+    context: DoctorContext, kind: str, wanted: str, nodes: list[DeviceFile], group: str, connect: SomeSteps
 ) -> Finding:
     """Return whether the device file ``wanted`` is one of ``nodes`` and can be opened."""
     node = next((node for node in nodes if context.computer.same_file(node.path, wanted)), None)
-    return _missing(code, kind, wanted, nodes, fix) if node is None else access(context, node, group)
+    return _missing(kind, wanted, nodes, connect) if node is None else access(context, node, group)
 
 
-def _missing(code: str, kind: str, wanted: str, nodes: list[Any], fix: SomeSteps) -> Finding:
-    names = [f"{node.path} ({node.name})" for node in nodes]
-    return bad(code, f"there is no {kind} {{wanted}} (found: {{found}})", fix, wanted=wanted, found=names)
-
-
-def _no_serial_port(context: DoctorContext, key: str, wanted: str) -> Finding:
-    found = context.computer.serial_ports()
-    adapters = [port for port in found if port.usb]
+def _no_serial_port(context: DoctorContext, wanted: str) -> Finding:
+    adapters = [port for port in context.computer.serial_ports() if port.usb]
     if not adapters and (program := context.computer.running("brltty")) is not None:
         text = "there is no serial port {wanted}, and brltty (process {pid}) takes USB adapters for itself"
         return bad("brltty_takes_port", text, PORT_GRABBERS["brltty"], wanted=wanted, pid=program.pid)
-    fix: SomeSteps = Do.SETUP() if adapters else ("Plug the adapter in, then", Do.FIND())
-    if len(adapters) == 1:
-        fix = Do.SET_KEY(key=key, value=adapters[0].stable or adapters[0].path)
-    return _missing("no_serial_port", "serial port", wanted, found, fix)
+    return _missing("serial port", wanted, adapters, ("Plug the adapter in, then", Do.FIND()))
+
+
+def _missing(kind: str, wanted: str, found: Sequence[DeviceFile], connect: SomeSteps) -> Finding:
+    text = "there is no {kind} {wanted} (found: {found})"
+    names = [f"{node.path} ({node.name})" for node in found]
+    return bad("not_connected", text, Do.SETUP() if found else connect, kind=kind, wanted=wanted, found=names)
 
 
 def access(context: DoctorContext, node: DeviceFile, usual_group: str) -> Finding:
@@ -148,15 +139,14 @@ def disk(context: DoctorContext) -> Iterator[Finding]:
     path = context.config.catalog_path(context.bench)
     there, user = context.computer.disk(path), context.computer.user.name
     views = there.free_bytes // VIEW_BYTES
-    free = {"free_gb": there.free_bytes / 1e9, "path": path, "objects": views // context.config.enroll.views}
-    yield graded(
-        "free_space",
-        "{free_gb:.1f} GB free for {path}: about {objects} more objects",
-        Do.REMOVE_DELETED(),
-        is_bad=there.free_bytes < TOO_LITTLE_ROOM,
-        is_warning=there.free_bytes < LITTLE_ROOM,
-        **free,
-    )
+    free: dict[str, Any] = {
+        "free_gb": there.free_bytes / 1e9,
+        "path": path,
+        "objects": views // context.config.enroll.views,
+    }
+    is_bad, is_warning = there.free_bytes < TOO_LITTLE_ROOM, there.free_bytes < LITTLE_ROOM
+    text = "{free_gb:.1f} GB free for {path}: about {objects} more objects"
+    yield graded("free_space", text, Do.REMOVE_DELETED(), is_bad=is_bad, is_warning=is_warning, **free)
     if not there.writable:
         fix: str | NextStep = Do.SET_KEY(key="catalog.path", value="FOLDER")
         fix = f"sudo chown -R {user} {path}" if path.exists() else fix
@@ -174,10 +164,8 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
         yield bad("wrong_date", f"the date is wrong: {date}: stored data would have a wrong date", set_time, utc=now)
     elif synchronised:
         yield fine("synchronized", f"{date}, synchronised by a time server", utc=now)
-    elif synchronised is None:
-        yield warning("no_time_server", f"{date}, no time server that is known here", set_time, utc=now)
     else:
-        text = f"{date}, but no time server has been reached since this computer started"
+        text = f"{date}, but no time server is known to have been reached since this computer started"
         yield warning("not_synchronized", text, set_time, utc=now)
 
 

@@ -19,7 +19,7 @@ from rig.devices.head.protocol import BAUD
 from rig.devices.i2c import NO_DEVICE, RESTART_CONTROLLER, STUCK, controller_hangs, unbind_command
 from rig.devices.imu import Imu, ImuSamples, open_imu
 from rig.doctor.examination import DoctorContext
-from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, bad, fine, graded, of_error, warning
 from rig.safety.gyro_rotation import DRAIN_SAMPLES
 
 SECONDS, DRAIN_S = 1.5, 0.25
@@ -161,12 +161,10 @@ def _wrong(context: DoctorContext, here: FoundImu | None, usable: list[FoundImu]
     """Return why the configured sensor is not there: what is at its address, or at which address another is."""
     config = context.config.imu
     if here is not None:
-        fix: SomeSteps = Do.SET_KEY(key="imu.model", value=here.driver)
         other = {"found": here, "address": here.address, "model": config.model}
-        return unusable(context.computer, here) or bad("other_imu", "{found}, but imu.model is {model}", fix, **other)
-    fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
-    if usable:
-        fix = Do.SET_KEY(key="imu.address", value=f"{usable[0].address:#04x}")
+        text = "{found}, but imu.model is {model}"
+        return unusable(context.computer, here) or bad("other_imu", text, Do.SETUP(), **other)
+    fix = Do.SETUP() if usable else ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
     text = "no device answers at {address:#04x} of {bus} (at other IMU addresses: {found})"
     bus = context.computer.i2c_name(config.bus)
     return bad("no_imu", text, fix, address=config.address, bus=bus, found=usable)
@@ -214,13 +212,11 @@ def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Finding:
     if (rates == rates[0]).all():
         fix = "Switch the sensor's supply off and on, then"
         return bad("imu_frozen", "frozen: all samples are identical, without noise", (fix, Do.DOCTOR()), **evidence)
-    if spread.max() > NO_REST_DPS:
-        fix = "Check the sensor's supply, ground and cable, then"
-        return bad("not_at_rest", f"{noise}, {zero}: more than a table at rest shows", (fix, Do.DOCTOR()), **evidence)
-    if spread.max() > NOISY * expected:
-        fix = "Keep hands and vibration away from the bench, then"
-        text = f"{noise} at rest; {{expected_dps:.3f}} °/s is usual"
-        return warning("noisy", text, (fix, Do.DOCTOR()), expected_dps=expected, **evidence)
+    is_bad, is_noisy = spread.max() > NO_REST_DPS, spread.max() > NOISY * expected
+    if is_bad or is_noisy:
+        fix = "Keep hands and vibration away from the bench, and check the sensor's supply, ground and cable, then"
+        text, evidence = f"{noise} at rest; {{expected_dps:.3f}} °/s is usual", {"expected_dps": expected} | evidence
+        return graded("noisy", text, (fix, Do.DOCTOR()), is_bad=is_bad, is_warning=is_noisy, **evidence)
     if abs(bias) > MAX_BIAS_DPS:
         return bad("large_bias", f"{zero}: outside the datasheet", "Replace the sensor", **evidence)
     return fine("at_rest", f"at rest: {noise}, {zero}", **evidence)

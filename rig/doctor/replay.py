@@ -4,8 +4,8 @@ The drivers must understand the recorded bytes as they did when they were record
 recorded requests at their times, and their answers are compared with the recorded ones, register by register.
 """
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from statistics import median
@@ -19,7 +19,6 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.packets import PING, READ, WRITE, Packets, Reply
 from rig.devices.dynamixel.port import READ_SLICE_S, BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import ControlTable, control_table
-from rig.devices.head.link import Deframer, HeadStatistics
 from rig.devices.i2c import I2cBus
 from rig.devices.imu import open_imu
 from rig.devices.opencv_camera import OpenCvCamera
@@ -35,7 +34,7 @@ _TOLERANCES: Final = {
 _ANGLES: Final = ("Present Position", "Position Trajectory")
 _RATES: Final = ("Present Velocity", "Velocity Trajectory")
 _SWITCHING: Final = ("Moving", "Moving Status")
-"""Registers that change at a moment: one reading earlier or later is no difference."""
+"""Registers that are not compared: they change at a moment, which may be one reading earlier or later."""
 _OF_THE_BUS: Final = ("ID", "Baud Rate", "Secondary ID", "Protocol Type")
 _ONLY_WRITTEN: Final = ("Goal", "Profile", "Bus Watchdog", "LED", "Moving Speed", "Torque", "Realtime Tick")
 """Beginnings of the registers that depend on what happened before the trace, until they are written."""
@@ -43,39 +42,31 @@ _SET_UP_S: Final = 60.0
 """Longest time in which the simulated servo rotates to the recorded angle."""
 
 
-@dataclass(slots=True)
-class Compared:
-    """A register or another field: how often its value was compared, how often it differs, and where first."""
-
-    name: str
-    compared: int = 0
-    differing: int = 0
-    first: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.name} {self.first} ({self.differing} of {self.compared} differ)"
-
-
-@dataclass(slots=True)
 class Replay:
     """What a replay has compared; ``reply_ms`` are the times of the servo's replies, recorded and now."""
 
-    fields: dict[str, Compared] = field(default_factory=dict)
-    reply_ms: list[tuple[float, float]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.reply_ms: list[tuple[float, float]] = []
+        self._compared: Counter[str] = Counter()
+        self._differing: Counter[str] = Counter()
+        self._first: dict[str, str] = {}
 
     def compare(self, name: str, t_ns: int, recorded: Any, now: Any, tolerance: float = 0.0) -> None:
-        one = self.fields.setdefault(name, Compared(name))
-        one.compared += 1
+        """Compare two values of a register or of another field."""
+        self._compared[name] += 1
         if recorded != now and not (tolerance and abs(recorded - now) <= tolerance):
-            one.first = one.first or f"at {t_ns * 1e-9:.3f} s: recorded {recorded}, now {now}"
-            one.differing += 1
+            self._differing[name] += 1
+            self._first.setdefault(name, f"at {t_ns * 1e-9:.3f} s: recorded {recorded}, now {now}")
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as `--json` prints it."""
         times = dict(zip(("recorded", "now"), zip(*self.reply_ms, strict=True), strict=False))
         return {
-            "compared": sum(one.compared for one in self.fields.values()),
-            "differences": [str(one) for one in self.fields.values() if one.differing],
+            "compared": self._compared.total(),
+            "differences": [
+                f"{name} {first} ({self._differing[name]} of {self._compared[name]} differ)"
+                for name, first in self._first.items()
+            ],
             "reply_ms": {key: {"median": median(ms), "longest": max(ms)} for key, ms in times.items()},
         }
 
@@ -84,21 +75,18 @@ def replay_drivers(trace: Trace) -> Replay:
     """Let the drivers read the recorded bytes; compare what they understand with what they understood then."""
     result, clock = Replay(), _TraceClock()
     port = _PlayedPort(clock, result)
-    for request, reply in _ask(DynamixelBus(ClockedPort(port, clock)), clock, _requests(trace), result, port.begin):
-        result.compare("servo reply", request.t_ns, request.reply, reply)
+    bus = DynamixelBus(ClockedPort(port, clock))
+    for request in _requests(trace):
+        port.request = request
+        result.compare("servo reply", request.t_ns, request.reply, _ask(bus, request, 0, result))
     notes = trace.notes("imu")
     if "samples" in notes and trace.config.imu.connection == "i2c":
         clock = _TraceClock()
-        bus, now = _PlayedI2c(clock, trace.of("imu")), {}
-        with suppress(RigError, ValueError), closing(open_imu(trace.config.imu, bus, clock)) as imu:
+        sensor, now = _PlayedI2c(clock, trace.of("imu")), {}
+        with suppress(RigError, ValueError), closing(open_imu(trace.config.imu, sensor, clock)) as imu:
             now = imu_notes(imu, clock)
         for name in now or notes:
             result.compare(f"imu {name}", clock.now_ns(), notes.get(name), now.get(name))
-    statistics = HeadStatistics()
-    deframer = Deframer(statistics)
-    for event in trace.of("head"):
-        before, _ = statistics.crc_errors + statistics.malformed, list(deframer.feed(event.read or b""))
-        result.compare("head corrupt frames", event.t_ns, before, statistics.crc_errors + statistics.malformed)
     return result
 
 
@@ -110,8 +98,9 @@ def replay_devices(trace: Trace, computer: Computer) -> Replay:
         with closing(computer.open_serial(config.servo.port, config.servo.baud)) as connection:
             servo = _Servo(DynamixelBus(ClockedPort(connection, clock)), config, requests)
             servo.set_up(clock)
-            for request, reply in _ask(servo.bus, clock, requests, result):
-                servo.compare(result, request, reply)
+            start_ns = clock.now_ns()
+            for request in requests:
+                servo.compare(result, request, _ask(servo.bus, request, start_ns, result))
     if registers := [event for event in trace.of("imu") if event.address is not None]:
         with closing(I2cBus(computer.i2c_path(config.imu.bus))) as bus:
             _compare_imu(result, registers, config.imu.address, bus, clock)
@@ -152,32 +141,20 @@ def _requests(trace: Trace) -> list[_Request]:
     return requests
 
 
-def _ask(
-    bus: DynamixelBus,
-    clock: Clock,
-    requests: list[_Request],
-    result: Replay,
-    before: Callable[[_Request], object] = lambda _: None,
-) -> Iterator[tuple[_Request, Reply | None]]:
-    """Send requests at their times, and yield them with the reply that the driver accepts; call ``before`` first."""
-    start_ns = clock.now_ns()
-    for request in requests:
-        before(request)
-        clock.sleep(seconds_between(clock.now_ns(), start_ns + request.t_ns))
-        begun_ns = clock.now_ns()
-        bus_id, kind, parameters = request.instruction
-        reply: Reply | None = None
-        with suppress(BusBabble, IndexError):
-            size = _block(parameters)[1] if kind == READ else 3 * (kind == PING)
-            reply = bus.ask(bus_id, kind, parameters, size)[0].get(bus_id)
-        bus.port.is_using = False
-        if reply is not None and request.reply is not None:
-            result.reply_ms.append((request.reply_ms, seconds_between(begun_ns, clock.now_ns()) * 1e3))
-        yield request, reply
-
-
-def _block(parameters: bytes) -> tuple[int, int]:
-    return int.from_bytes(parameters[:2], "little"), int.from_bytes(parameters[2:], "little")
+def _ask(bus: DynamixelBus, request: _Request, start_ns: int, result: Replay) -> Reply | None:
+    """Send a request at its time after ``start_ns``, and return the reply that the driver accepts."""
+    clock = bus.port.clock
+    clock.sleep(seconds_between(clock.now_ns(), start_ns + request.t_ns))
+    begun_ns = clock.now_ns()
+    bus_id, kind, parameters = request.instruction
+    reply: Reply | None = None
+    with suppress(BusBabble, IndexError):
+        size = int.from_bytes(parameters[2:], "little") if kind == READ else 3 * (kind == PING)
+        reply = bus.ask(bus_id, kind, parameters, size)[0].get(bus_id)
+    bus.port.is_using = False
+    if reply is not None and request.reply is not None:
+        result.reply_ms.append((request.reply_ms, seconds_between(begun_ns, clock.now_ns()) * 1e3))
+    return reply
 
 
 class _Servo:
@@ -187,7 +164,6 @@ class _Servo:
         self._table = control_table(config.servo.model, self._first(requests).get("Firmware Version"))
         self._initial = self._first(requests)
         self._written: set[int] = set()
-        self._last: dict[str, tuple[int, int]] = {}
         row = self._table.row
         self._tolerances = _TOLERANCES | dict.fromkeys(_ANGLES, max(_ANGLE_DEG / row.deg_per_count, 1.0))
         self._tolerances |= dict.fromkeys(_RATES, max(_RATE_DPS / row.dps_per_unit, 1.0))
@@ -219,13 +195,10 @@ class _Servo:
         result.compare("servo error", t_ns, (recorded.error, recorded.alert), (reply.error, reply.alert))
         values = dict(self._values(request, reply))
         for name, before in self._values(request, recorded):
-            now = values.get(name)
-            if name.startswith(_ONLY_WRITTEN) and self._table[name].address not in self._written:
-                continue
-            if now is not None and name in _SWITCHING:
-                last, self._last[name] = self._last.get(name, (before, now)), (before, now)
-                now = before if now == last[0] or before == last[1] else now
-            result.compare(f"servo {name}", t_ns, before, now, 0.0 if now is None else self._tolerances.get(name, 0.0))
+            unknown = name.startswith(_ONLY_WRITTEN) and self._table[name].address not in self._written
+            if not unknown and name not in _SWITCHING:
+                tolerance = self._tolerances.get(name, 0.0) if name in values else 0.0
+                result.compare(f"servo {name}", t_ns, before, values.get(name), tolerance)
 
     def _first(self, requests: list[_Request]) -> dict[str, int]:
         answered = [(request, request.reply) for request in requests if request.reply is not None]
@@ -236,7 +209,7 @@ class _Servo:
         _, kind, parameters = request.instruction
         if reply.error or kind not in (READ, PING):
             return
-        start = _block(parameters)[0] if kind == READ else 0
+        start = int.from_bytes(parameters[:2], "little") if kind == READ else 0
         for name, register in self._table.items():
             at = register.address - start
             # After the Model Number, a ping reports the firmware, which has another address.
@@ -264,13 +237,11 @@ class _PlayedPort:
     """A port at whose other end the recorded servo answers each request at its time."""
 
     baudrate, in_waiting = 57_600, 0  # the recorded times matter, not the rate
+    request: _Request
 
     def __init__(self, clock: _TraceClock, result: Replay) -> None:
         self._clock, self._result = clock, result
         self._coming: deque[tuple[int, bytes]] = deque()
-
-    def begin(self, request: _Request) -> None:
-        self._request = request
 
     def read(self, size: int = 1) -> bytes:
         end_ns = self._clock.time_ns + round(READ_SLICE_S * 1e9)
@@ -284,8 +255,8 @@ class _PlayedPort:
         return data[:size]
 
     def write(self, data: bytes, /) -> int:
-        self._result.compare("servo request", self._request.t_ns, self._request.packet.hex(), data.hex())
-        self._coming.extend(self._request.received)
+        self._result.compare("servo request", self.request.t_ns, self.request.packet.hex(), data.hex())
+        self._coming.extend(self.request.received)
         return len(data)
 
     def reset_input_buffer(self) -> None:

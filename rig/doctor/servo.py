@@ -8,20 +8,19 @@ from typing import Any
 from rig.config import ServoConfig
 from rig.config.servos import DynamixelModel
 from rig.core.clock import seconds_between
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.core.errors import DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.dynamixel.registers import control_table, model_of, obstacle, servo_plugin
+from rig.devices.dynamixel.registers import control_table, servo_plugin
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
 from rig.doctor.examination import DoctorContext
-from rig.doctor.finding import Finding, bad, fine, graded, of_error, warning
-from rig.doctor.servo_scan import BAUD_RATES, BaudScan, FoundServo, scan_servos
+from rig.doctor.finding import Finding, bad, fine, graded, warning
+from rig.doctor.servo_scan import BAUD_RATES, BaudScan, scan_servos
 
 READS = 100  # finds one bad reading in fifty; takes half a second at 57,600 bit/s
 REPEATED = 2  # number of repeated readings on a good bus
 SLOW = 1 / 3  # share of the control loop's period that a reading may take; the usual cause of more is the latency timer
-IMPOSSIBLE_C = 150
 
 
 def servo(context: DoctorContext) -> Iterator[Finding]:
@@ -40,11 +39,6 @@ def servo(context: DoctorContext) -> Iterator[Finding]:
             if foreign:
                 raise
             yield _elsewhere(context, wire)
-            return
-        except DeviceMismatch as error:
-            number = error.evidence.get("model_number")  # another maker's driver may not report it
-            model = None if number is None or obstacle(number) else model_of(number)
-            yield of_error(error, Do.SET_KEY(key="servo.model", value=model) if model else "")
             return
         except DeviceSilent:
             if not foreign:
@@ -76,25 +70,13 @@ def _elsewhere(context: DoctorContext, wire: SerialConnection) -> Finding:
     if not there:
         fix = ("Check the servo's cable and switch on its 12 V supply (its LED blinks once), then", Do.DOCTOR())
         return bad("no_servo", f"{text}, nor any other at any baud rate", fix, **_place(config))
-    use = Do.SETUP() if len(there) > 1 else _use(config, there[0])
+    obstacle = there[0].obstacle if len(there) == 1 else None
+    use = obstacle[1] if obstacle else Do.SETUP()
     return bad("other_servos", f"{text} (found: {{found}})", use, found=there, **_place(config))
 
 
 def _place(config: ServoConfig) -> dict[str, Any]:
     return {"id": config.id, "baud": config.baud, "port": config.port}
-
-
-def _use(config: ServoConfig, there: FoundServo) -> SomeSteps:
-    """Return the command that changes the configuration to the servo found, if the rig can drive it."""
-    if there.obstacle:
-        return there.obstacle[1]
-    differing = {
-        "servo.id": (config.id, there.bus_id),
-        "servo.baud": (config.baud, there.baud),
-        "servo.model": (config.model, there.model),
-    }
-    changes = [Do.SET_KEY(key=key, value=now) for key, (was, now) in differing.items() if was != now]
-    return changes[0] if len(changes) == 1 else Do.SETUP()
 
 
 def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Finding:
@@ -148,32 +130,17 @@ def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
         yield warning("watchdog_tripped", text, Do.STATUS())
     if condition.torque:
         yield warning("torque_on", "its torque is on although no program uses it", Do.STOP())
-    # Supply and temperature, unless its sensors are broken.
+    # Supply and temperature.
     low, high = limits.voltage_v
-    if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
-        text = "reports impossible values: {voltage_v:.1f} V and {temperature_c:.0f} °C"
-        fix = "Replace the servo, or its cable if another servo reports the same"
-        yield bad("impossible_values", text, fix, voltage_v=state.voltage_v, temperature_c=state.temperature_c)
-        return
     beyond_v = max(low - state.voltage_v, state.voltage_v - high)
-    yield graded(
-        "supply",
-        "supply {voltage_v:.1f} V (the servo shuts down outside {low_v:.1f}–{high_v:.1f} V)",
-        "Check the power supply and its plug",
-        is_bad=beyond_v > 0,
-        is_warning=beyond_v > -safety.voltage_margin_v,
-        voltage_v=state.voltage_v,
-        low_v=low,
-        high_v=high,
-    )
-    yield graded(
-        "temperature",
-        "temperature {temperature_c:.0f} °C (the servo shuts down above {limit_c:.0f} °C)",
-        "Let it cool, and find out why the table is hard to rotate",
-        is_bad=state.temperature_c >= limits.temperature_c - safety.temperature_margin_c,
-        temperature_c=state.temperature_c,
-        limit_c=limits.temperature_c,
-    )
+    supply: dict[str, Any] = {"voltage_v": state.voltage_v, "low_v": low, "high_v": high}
+    text = "supply {voltage_v:.1f} V (the servo shuts down outside {low_v:.1f}–{high_v:.1f} V)"
+    fix = "Check the power supply and its plug"
+    yield graded("supply", text, fix, is_bad=beyond_v > 0, is_warning=beyond_v > -safety.voltage_margin_v, **supply)
+    hot = state.temperature_c >= limits.temperature_c - safety.temperature_margin_c
+    heat: dict[str, Any] = {"temperature_c": state.temperature_c, "limit_c": limits.temperature_c}
+    text = "temperature {temperature_c:.0f} °C (the servo shuts down above {limit_c:.0f} °C)"
+    yield graded("temperature", text, "Let it cool, and find out why the table is hard to rotate", is_bad=hot, **heat)
 
 
 def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Finding:

@@ -118,15 +118,17 @@ def _scan(port: ClockedPort, baud: int) -> BaudScan:
         for bus_id, (number, firmware) in sorted(answers.items())
     ]
     bus = DynamixelBus(port, retries=0)
-    duplicate_ids = [servo.bus_id for servo in servos if _corrupt_reads(bus, servo) > _STATUS_READS // 2]
+    duplicate_ids = [servo.bus_id for servo in servos if _collides(bus, servo.bus_id, servo.model)]
     # The SDK skips what it cannot read, and reports success. Answers of servos with the same id collide: if more bytes
     # came than belong to complete answers, ask each id separately.
     rest = len(listening.answered) - _PING_ANSWER * len(answers)
     for bus_id in (bus_id for bus_id in range(MAX_ID + 1) if rest and bus_id not in answers):
+        corrupt = bus.statistics.corrupt
         try:
             head = bus.read_block(bus_id, 0, 7)
         except (RequestRejected, DeviceSilent):
-            duplicate_ids += [bus_id] if _answers_corrupt(bus, bus_id) else []
+            if bus.statistics.corrupt > corrupt and _collides(bus, bus_id):
+                duplicate_ids.append(bus_id)
         else:  # its answer to the broadcast was corrupt, this one is not
             number = int.from_bytes(head[:2], "little")
             servos.append(FoundServo(bus_id, baud, model_of(number), number, head[6]))
@@ -165,34 +167,15 @@ def _babbles(port: ClockedPort) -> bool:
     return False
 
 
-def _corrupt_reads(bus: DynamixelBus, servo: FoundServo) -> int:
-    """Return how many reads of a servo's status came back corrupt."""
-    row = model_row(servo.model) if servo.model else None
+def _collides(bus: DynamixelBus, bus_id: int, model: str | None = None) -> bool:
+    """Return whether most answers of an id are corrupt: two servos have it."""
+    row = model_row(model) if model else None
     address = next((address for address, _, name in row.registers if name == _STATUS), 120) if row else 120
-    corrupt = 0
+    before = bus.statistics.corrupt
     for _ in range(_STATUS_READS):
-        try:
-            bus.read_block(servo.bus_id, address, _STATUS_SIZE)
-        except RequestRejected:
-            continue
-        except DeviceSilent:
-            corrupt += 1
-    return corrupt
-
-
-def _answers_corrupt(bus: DynamixelBus, bus_id: int) -> bool:
-    """Return whether each of three pings of an id gets a corrupt answer."""
-    for _ in range(3):
-        corrupt = bus.statistics.corrupt
-        try:
-            bus.ping(bus_id)
-        except DeviceSilent:
-            if bus.statistics.corrupt > corrupt:
-                continue
-        except RequestRejected:
-            pass
-        return False
-    return True
+        with suppress(RequestRejected, DeviceSilent):
+            bus.read_block(bus_id, address, _STATUS_SIZE)
+    return bus.statistics.corrupt - before > _STATUS_READS // 2
 
 
 # -- one servo that is alone on its bus -------------------------------------------------------------------------------
@@ -210,13 +193,10 @@ class SingleServo:
         self.table: ControlTable = control_table(found.model, found.firmware)
 
     def set_id(self, new: int) -> None:
-        """Change the id of the servo.
+        """Change the id of the servo, to one from 0 to `MAX_ID`.
 
-        Raises `UsageError`: the id is out of range. `RequestRejected`: the servo did not accept the id; it answers to
-        the old one.
+        Raises `RequestRejected`: the servo did not accept the id; it answers to the old one.
         """
-        if not 0 <= new <= MAX_ID:
-            raise UsageError(f"No servo has the id {new}.", next_step=f"Choose an id from 0 to {MAX_ID}.")
         self._torque_off()
         self._write("ID", new)
         self._verify(new, "ID", new, f"the id {new}")
