@@ -94,7 +94,7 @@ def faults(settings: Settings) -> None:
     Example: rig faults; then rig demo --fault jam@move3+2s --fault crc_flip:rate=0.2
     """
     from sim.faults import fault_kinds
-    from sim.faults.schedule import NOTATION
+    from sim.faults.kind import NOTATION
 
     if settings.json:
         for kind in fault_kinds().values():

@@ -37,8 +37,8 @@ from rig.search.strategies import descriptor_for, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
 from sim.change import Change
+from sim.faults import Fault
 from sim.faults.injector import Occurrence
-from sim.faults.schedule import Fault
 from sim.noise import NoiseModel
 from sim.objects.photographs import PhotographsOnTable
 from sim.objects.shelf import shelf

@@ -3,8 +3,8 @@
 `fault_kinds` lists them, `Fault` is one with its parameters and its time, `Faults` injects them.
 """
 
+from sim.faults import camera, environment, imu, servo  # noqa: F401 - each module registers its faults
 from sim.faults.injector import Faults
-from sim.faults.kind import FaultKind
-from sim.faults.schedule import Fault, fault_kinds
+from sim.faults.kind import Fault, FaultKind, fault_kinds
 
 __all__ = ["Fault", "FaultKind", "Faults", "fault_kinds"]

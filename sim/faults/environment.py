@@ -5,10 +5,8 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from sim.devices import SimDevices
-from sim.faults.kind import End, Parameter, Values, simulated_fault
+from sim.faults.kind import End, Parameter, Rng, simulated_fault
 
 _os: Any = os
 
@@ -32,7 +30,7 @@ def fill_disk() -> Callable[[], None]:
 
 
 @simulated_fault("object_falls", "The object falls off the platter.")
-def _object_falls(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _object_falls(devices: SimDevices, _rng: Rng) -> End:
     fallen = devices.world.scene.object
     devices.world.change(object=None)
     return lambda: devices.world.change(object=fallen)
@@ -46,16 +44,16 @@ def _object_falls(devices: SimDevices, _values: Values, _rng: np.random.Generato
     ),
     angle=Parameter(120.0, "rotation on the platter, °", -360, 360),
 )
-def _object_moved(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+def _object_moved(devices: SimDevices, rng: Rng, other: float, angle: float) -> End:
     world, before = devices.world, devices.world.scene
-    names, place = sorted(devices.objects), int(values["other"])
+    names, place = sorted(devices.objects), int(other)
     put = devices.objects[names[(place - 1) % len(names)]] if place else before.object
     dx_mm, dy_mm = rng.normal(0.0, world.noise.placement_mm, 2).tolist()
-    world.put(put, before.yaw_deg + values["angle"], (dx_mm, dy_mm))
+    world.put(put, before.yaw_deg + angle, (dx_mm, dy_mm))
     return lambda: world.put(before.object, before.yaw_deg, before.offset_mm)
 
 
-simulated_fault("disk_full", "The computer's disk is full. Nothing can be stored.")(lambda _, __, ___: fill_disk())
+simulated_fault("disk_full", "The computer's disk is full. Nothing can be stored.")(lambda _, __: fill_disk())
 
 
 @simulated_fault(
@@ -63,6 +61,6 @@ simulated_fault("disk_full", "The computer's disk is full. Nothing can be stored
     "The computer's date and time change, set by a time server or by hand.",
     seconds=Parameter(-3600.0, "change, s", -1e9, 1e9),
 )
-def _clock_jump(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.world.clock.set_civil(values["seconds"])
-    return lambda: devices.world.clock.set_civil(-values["seconds"])
+def _clock_jump(devices: SimDevices, _rng: Rng, seconds: float) -> End:
+    devices.world.clock.set_civil(seconds)
+    return lambda: devices.world.clock.set_civil(-seconds)

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from sim.clock import Timer
 from sim.devices import SimDevices
-from sim.faults.kind import End
-from sim.faults.schedule import Fault, FaultTrigger
+from sim.faults.kind import End, Fault, FaultTrigger
 from sim.world import Activity
 
 DURING_S = 0.1  # within the ramp of every move
@@ -34,11 +33,11 @@ class Faults:
     def __init__(self, devices: SimDevices) -> None:
         self.history: list[Occurrence] = []
         self.listeners: list[Callable[[Occurrence], None]] = []
-        self._parts = devices
+        self._devices = devices
         self._clock = devices.world.clock
         self._waiting: list[Fault] = []
         self._timers: list[Timer] = []
-        self._active: dict[int, tuple[Fault, End]] = {}
+        self._active: dict[int, tuple[Fault, End | None]] = {}
         self._views = 0
         self._moved = True
         self._set_off_for = -1
@@ -101,9 +100,9 @@ class Faults:
     def _begin(self, fault: Fault) -> None:
         number = self._begun
         self._begun += 1
-        rng = self._parts.world.rng(f"fault {number} {fault.kind.name}")
+        rng = self._devices.world.rng(f"fault {number} {fault.kind.name}")
         self._report(fault, began=True)
-        self._active[number] = fault, fault.kind.begin(self._parts, fault.values, rng)
+        self._active[number] = fault, fault.kind.begin(self._devices, rng, **fault.values)
         if fault.for_s is not None:
             at_ns = self._clock.now_ns() + round(fault.for_s * 1e9)
             self._timers.append(self._clock.call_at(at_ns, lambda: self._end(number)))
@@ -111,7 +110,8 @@ class Faults:
     def _end(self, number: int) -> None:
         if number in self._active:
             fault, end = self._active.pop(number)
-            end()
+            if end is not None:
+                end()
             self._report(fault, began=False)
 
     def _report(self, fault: Fault, *, began: bool) -> None:

@@ -1,25 +1,34 @@
-"""A kind of simulated fault: its name, description, parameters, beginning and end.
+"""Kinds of simulated faults, and faults with their times in a short notation (``jam@move3+2s``).
 
 Decision: docs/decisions/0001.
 """
 
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
-from typing import TypeVar
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from enum import Enum
+from typing import Self, TypeVar
 
 import numpy as np
 
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from sim.clock import VirtualClock
-from sim.devices import SimDevices
 
-DEVICES = ("servo", "imu", "camera")
 F = TypeVar("F")
-Values = Mapping[str, float]
+Rng = np.random.Generator
 
 End = Callable[[], None]
 """A function that removes the cause of a fault; its consequences remain."""
+Begin = Callable[..., End | None]
+"""Starts a fault in the given `SimDevices`, with a generator of random numbers and the parameters by name.
+
+Returns the function that ends it; None for a fault whose cause is over at once.
+"""
+
+_DEVICES = ("servo", "imu", "camera")
+_OF_EVERY_DEVICE = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +46,9 @@ def share(default: float, of: str) -> Parameter:
     return Parameter(default, f"share of {of}", 0.0, 1.0)
 
 
-Begin = Callable[[SimDevices, Values, np.random.Generator], End]
-
-
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """A kind of simulated fault.
-
-    ``what`` describes it in a sentence. ``begin`` starts it in the given devices and returns the function that ends it.
-    """
+    """A kind of simulated fault; ``what`` describes it in a sentence."""
 
     name: str
     what: str
@@ -80,10 +83,34 @@ def simulated_fault(name: str, what: str, **parameters: Parameter) -> Callable[[
     """Register a function as the beginning of the fault ``name``: a decorator, or called with a lambda."""
 
     def register(begin: Begin) -> Begin:
-        registry[name] = FaultKind(name, what, MappingProxyType(parameters), begin)
+        registry[name] = FaultKind(name, what, parameters, begin)
         return begin
 
     return register
+
+
+def fault_kinds() -> dict[str, FaultKind]:
+    """Return all kinds by name: first the faults that every device can have, then the others."""
+    common = [f"{device}.{word}" for device in _DEVICES for word in _OF_EVERY_DEVICE]
+    return {name: registry[name] for name in dict.fromkeys([*common, *registry])}
+
+
+def find_fault(name: str) -> FaultKind:
+    """Return the kind called ``name``.
+
+    Raises `UsageError`: no kind has that name; the next step names the most similar ones.
+    """
+    if name in registry:
+        return registry[name]
+    of_devices = [f"{device}.{name}" for device in _DEVICES if f"{device}.{name}" in registry]
+    near = of_devices or get_close_matches(name, fault_kinds(), n=2, cutoff=0.5)
+    raise UsageError(
+        f"There is no fault {name!r}.",
+        next_step=f"Did you mean {' or '.join(near)}?" if near else Do.LIST_FAULTS(),
+    )
+
+
+# -- what most faults do ----------------------------------------------------------------------------------------------
 
 
 def switched(thing: object, attribute: str, value: object, back: object) -> End:
@@ -102,3 +129,75 @@ def repeatedly(clock: VirtualClock, period_s: float, action: Callable[[], None])
     """Call ``action`` now and every ``period_s`` from now on; return the function that stops it."""
     action()
     return clock.every(period_s, action)
+
+
+# -- faults with their times ------------------------------------------------------------------------------------------
+
+NOTATION = "NAME[:PARAMETER=VALUE...][@TIME[+2s]], where TIME is 12s, move3 or view10 and +2s is the duration"
+
+_FAULT = re.compile(
+    r"(?P<name>[a-z0-9_.]+)(?P<values>(?::[a-z0-9_]+=[^:@]*)*)"
+    r"(?:@(?:(?P<at>[\d.]+)s|move(?P<move>\d+)|view(?P<view>\d+))(?:\+(?P<length>[\d.]+)s)?)?"
+)
+
+
+class FaultTrigger(Enum):
+    """The events that start a fault."""
+
+    AT = "at"
+    MOVE = "move"
+    VIEW = "view"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A simulated fault with its time."""
+
+    kind: FaultKind
+    """Its kind."""
+    values: Mapping[str, float] = field(default_factory=dict)
+    """The values of all its parameters."""
+    trigger: FaultTrigger = FaultTrigger.AT
+    mark: float = 0.0
+    """It begins at ``mark`` seconds of the bench's clock, or during the move or after the view with that number.
+    `sim.faults.injector.Faults` counts moves and views from 0."""
+    for_s: float | None = None
+    """Its duration; None: it lasts until it is ended."""
+
+    def __str__(self) -> str:
+        parameters = self.kind.parameters
+        given = "".join(
+            f":{name}={value:g}" for name, value in self.values.items() if value != parameters[name].default
+        )
+        when = f"{self.mark:g}s" if self.trigger is FaultTrigger.AT else f"{self.trigger.value}{self.mark:g}"
+        length = "" if self.for_s is None else f"+{self.for_s:g}s"
+        return f"{self.kind.name}{given}@{when}{length}"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the fault that a text in the short notation describes.
+
+        Raises `UsageError` if the text cannot be read, or the fault or a parameter does not exist.
+        """
+        match = _FAULT.fullmatch(text.strip())
+        if not match:
+            raise UsageError(f"Cannot read the fault {text!r}.", next_step=f"Write {NOTATION}.")
+        kind = find_fault(match["name"])
+        given = dict(entry.split("=", 1) for entry in match["values"].split(":")[1:])
+        values = {name: _number(kind.name, name, value) for name, value in given.items()}
+        trigger = next((one for one in FaultTrigger if match[one.value] is not None), FaultTrigger.AT)
+        mark = _number(kind.name, "the time", match[trigger.value] or "0")
+        for_s = None if match["length"] is None else _number(kind.name, "the duration", match["length"])
+        if for_s == 0:
+            raise UsageError(f"The fault {kind.name} has no duration.", next_step="Give a time above 0.")
+        return cls(kind, kind.values(values), trigger, mark, for_s)
+
+
+def _number(name: str, key: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if value != value:
+        raise UsageError(f"{key} = {text!r} of the fault {name} is not a number.", next_step="Give a number.")
+    return value

@@ -3,11 +3,9 @@
 from collections import deque
 from dataclasses import replace
 
-import numpy as np
-
 from rig.core.clock import seconds_between
 from sim.devices import SimDevices
-from sim.faults.kind import End, Parameter, Values, added, repeatedly, share, simulated_fault, switched
+from sim.faults.kind import End, Parameter, Rng, added, repeatedly, share, simulated_fault, switched
 from sim.servo import SentBytes, SimServo
 from sim.servo.control_table import Memory
 from sim.servo.device import OVERLOAD_ERROR
@@ -26,13 +24,13 @@ def _later(frame: SentBytes, seconds: float) -> SentBytes:
 
 
 @simulated_fault("servo.off", "The servo loses its supply. When it starts again, its count of revolutions is lost.")
-def _off(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _off(devices: SimDevices, _rng: Rng) -> End:
     devices.servo.power_off()
     return devices.servo.power_on
 
 
 @simulated_fault("servo.stuck", "The servo's status registers do not change while the shaft moves.")
-def _stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _stuck(devices: SimDevices, _rng: Rng) -> End:
     readings: list[bytes] = []
 
     def hold(memory: Memory) -> None:
@@ -43,9 +41,7 @@ def _stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> E
 
 
 simulated_fault("servo.garbage", "The servo's status registers contain random bytes, with a valid CRC.")(
-    lambda devices, _, rng: added(
-        devices.servo.distortions, lambda memory: memory.set_live(rng.bytes(len(memory.live())))
-    )
+    lambda devices, rng: added(devices.servo.distortions, lambda memory: memory.set_live(rng.bytes(len(memory.live()))))
 )
 
 
@@ -54,28 +50,27 @@ simulated_fault("servo.garbage", "The servo's status registers contain random by
     "The encoder's magnet slips on the shaft, so the servo goes to wrong angles.",
     angle=Parameter(5.0, "slip, °", -90, 90),
 )
-def _wrong(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.servo.slip_encoder(values["angle"])
-    return lambda: None
+def _wrong(devices: SimDevices, _rng: Rng, angle: float) -> None:
+    devices.servo.slip_encoder(angle)
 
 
 simulated_fault(
     "servo.slow",
     "Each answer is late but within the timeout, as with a USB latency timer of 16 ms.",
     seconds=Parameter(0.01, "delay, s", 0, 10),
-)(lambda devices, values, _: added(devices.servo_bus.filters, lambda frame: _later(frame, values["seconds"])))
+)(lambda devices, _, seconds: added(devices.servo_bus.filters, lambda frame: _later(frame, seconds)))
 
 
 @simulated_fault(
     "servo.delayed", "The servo reports old readings.", seconds=Parameter(0.3, "age of the readings, s", 0, 10)
 )
-def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+def _delayed(devices: SimDevices, _rng: Rng, seconds: float) -> End:
     clock, readings = devices.world.clock, deque[tuple[int, bytes]]()
 
     def age(memory: Memory) -> None:
         """Show the newest reading that is old enough, or else the oldest."""
         readings.append((clock.now_ns(), memory.live()))
-        while len(readings) > 1 and seconds_between(readings[1][0], clock.now_ns()) >= values["seconds"]:
+        while len(readings) > 1 and seconds_between(readings[1][0], clock.now_ns()) >= seconds:
             readings.popleft()
         memory.set_live(readings[0][1])
 
@@ -83,9 +78,7 @@ def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> 
 
 
 simulated_fault("servo.intermittent", "A contact is loose. Some answers are lost.", rate=share(0.05, "answers"))(
-    lambda devices, values, rng: added(
-        devices.servo_bus.filters, lambda frame: None if rng.random() < values["rate"] else frame
-    )
+    lambda devices, rng, rate: added(devices.servo_bus.filters, lambda frame: None if rng.random() < rate else frame)
 )
 
 
@@ -93,9 +86,9 @@ simulated_fault("servo.intermittent", "A contact is loose. Some answers are lost
 
 
 @simulated_fault("crc_flip", "Single bits of some answers flip on the servo bus.", rate=share(0.1, "answers"))
-def _crc_flip(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+def _crc_flip(devices: SimDevices, rng: Rng, rate: float) -> End:
     def flip(frame: SentBytes) -> SentBytes:
-        if rng.random() >= values["rate"]:
+        if rng.random() >= rate:
             return frame
         data = bytearray(frame.data)
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
@@ -110,10 +103,10 @@ def _crc_flip(devices: SimDevices, values: Values, rng: np.random.Generator) -> 
     rate=share(0.1, "answers"),
     seconds=Parameter(0.05, "delay, s", 0, 10),
 )
-def _late_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+def _late_reply(devices: SimDevices, rng: Rng, seconds: float, rate: float) -> End:
     return added(
         devices.servo_bus.filters,
-        lambda frame: _later(frame, values["seconds"]) if rng.random() < values["rate"] else frame,
+        lambda frame: _later(frame, seconds) if rng.random() < rate else frame,
     )
 
 
@@ -123,12 +116,12 @@ def _late_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -
     rate=share(0.2, "answers"),
     seconds=Parameter(0.04, "delay of the second one, s", 0, 10),
 )
-def _duplicate_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+def _duplicate_reply(devices: SimDevices, rng: Rng, rate: float, seconds: float) -> End:
     bus, clock = devices.servo_bus, devices.world.clock
 
     def repeat(frame: SentBytes) -> SentBytes:
-        if rng.random() < values["rate"]:
-            at_ns = frame.start_ns + round(values["seconds"] * 1e9)
+        if rng.random() < rate:
+            at_ns = frame.start_ns + round(seconds * 1e9)
             clock.call_at(max(at_ns, clock.now_ns()), lambda: bus.disturb(frame.data, frame.baudrate))
         return frame
 
@@ -140,24 +133,24 @@ def _duplicate_reply(devices: SimDevices, values: Values, rng: np.random.Generat
     "Random bytes appear on the servo bus, as from an open wire or a second controller.",
     period=Parameter(0.004, "time between bursts of 8 bytes, s", 0.0005, 10),
 )
-def _babble(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+def _babble(devices: SimDevices, rng: Rng, period: float) -> End:
     bus, adapter = devices.servo_bus, devices.adapter
-    return repeatedly(devices.world.clock, values["period"], lambda: bus.disturb(rng.bytes(8), adapter.baudrate))
+    return repeatedly(devices.world.clock, period, lambda: bus.disturb(rng.bytes(8), adapter.baudrate))
 
 
 simulated_fault("echo", "The adapter receives its own bytes.")(
-    lambda devices, _, __: switched(devices.servo_bus, "echo", True, False)
+    lambda devices, _: switched(devices.servo_bus, "echo", True, False)
 )
 
 
 @simulated_fault("unplug", "The servo's USB adapter is unplugged. After it is plugged in, it must be opened again.")
-def _unplug(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _unplug(devices: SimDevices, _rng: Rng) -> End:
     devices.adapter.unplug()
     return devices.adapter.replug
 
 
 @simulated_fault("duplicate_id", "A second servo with the same id answers.")
-def _duplicate_id(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _duplicate_id(devices: SimDevices, _rng: Rng) -> End:
     first = devices.servo
     world = World(noise=devices.world.noise, seed=devices.world.seed + 1, clock=devices.world.clock)
     twin = SimServo(world, first.model.name, bus_id=first.bus_id, baudrate=first.baudrate)
@@ -166,7 +159,7 @@ def _duplicate_id(devices: SimDevices, _values: Values, _rng: np.random.Generato
 
 
 @simulated_fault("wrong_model", "A servo of another model answers at the id.")
-def _wrong_model(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _wrong_model(devices: SimDevices, _rng: Rng) -> End:
     memory = devices.servo.memory
     number = memory["Model Number"]
     memory["Model Number"] = _XL430_MODEL if number == _OTHER_MODEL else _OTHER_MODEL
@@ -181,8 +174,8 @@ def _wrong_model(devices: SimDevices, _values: Values, _rng: np.random.Generator
     "The servo's supply voltage drops. Below 4.5 V the servo resets.",
     volts=Parameter(4.0, "supply voltage, V", 0, 30),
 )
-def _brownout(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    servo, volts = devices.servo, values["volts"]
+def _brownout(devices: SimDevices, _rng: Rng, volts: float) -> End:
+    servo, volts = devices.servo, volts
     if volts < LOWEST_SUPPLY_V:
         servo.power_off()
     servo.set_voltage(volts)
@@ -195,9 +188,8 @@ def _brownout(devices: SimDevices, values: Values, _rng: np.random.Generator) ->
 
 
 @simulated_fault("overload", "The servo shuts down because of an overload, until it is rebooted.")
-def _overload(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _overload(devices: SimDevices, _rng: Rng) -> None:
     devices.servo.fail(OVERLOAD_ERROR)
-    return lambda: None
 
 
 @simulated_fault(
@@ -205,16 +197,15 @@ def _overload(devices: SimDevices, _values: Values, _rng: np.random.Generator) -
     "The servo is hot. Above its limit it shuts down until it is rebooted.",
     celsius=Parameter(85.0, "temperature of the case, °C", -20, 150),
 )
-def _overheat(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+def _overheat(devices: SimDevices, _rng: Rng, celsius: float) -> End:
     cool_c = devices.servo.motor.temperature_c(0.0)
-    devices.servo.set_temperature(values["celsius"])
+    devices.servo.set_temperature(celsius)
     return lambda: devices.servo.set_temperature(cool_c)
 
 
 @simulated_fault("watchdog_trip", "The servo's Bus Watchdog stops the table, as after a pause of the computer.")
-def _watchdog_trip(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _watchdog_trip(devices: SimDevices, _rng: Rng) -> None:
     devices.servo.trip_watchdog()
-    return lambda: None
 
 
 # -- its gears and the platter ----------------------------------------------------------------------------------------
@@ -225,10 +216,10 @@ def _watchdog_trip(devices: SimDevices, _values: Values, _rng: np.random.Generat
     "The gears are worn and have a large backlash.",
     degrees=Parameter(4.0, "backlash, full width, °", 0, 90),
 )
-def _backlash(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+def _backlash(devices: SimDevices, _rng: Rng, degrees: float) -> End:
     world = devices.world
     noise = world.noise
-    world.noise = noise.with_values(backlash_deg=values["degrees"])
+    world.noise = noise.with_values(backlash_deg=degrees)
     return lambda: setattr(world, "noise", noise)
 
 
@@ -238,9 +229,8 @@ def _backlash(devices: SimDevices, values: Values, _rng: np.random.Generator) ->
     angle=Parameter(-6.0, "slip, °", -360, 360),
     seconds=Parameter(0.1, "duration of the slip, s", 0.001, 10),
 )
-def _slip(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.world.slip(values["angle"], values["seconds"])
-    return lambda: None
+def _slip(devices: SimDevices, _rng: Rng, angle: float, seconds: float) -> None:
+    devices.world.slip(angle, seconds)
 
 
 @simulated_fault(
@@ -249,12 +239,12 @@ def _slip(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End
     friction=Parameter(0.05, "friction, as a share of the stall torque", 0, 1),
     load=Parameter(0.005, "steady load that rotates clockwise, as a share of the stall torque", -1, 1),
 )
-def _friction(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.servo.motor.set_friction(values["friction"], values["load"])
+def _friction(devices: SimDevices, _rng: Rng, friction: float, load: float) -> End:
+    devices.servo.motor.set_friction(friction, load)
     return lambda: devices.servo.motor.set_friction()
 
 
 @simulated_fault("jam", "The shaft is blocked.")
-def _jam(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+def _jam(devices: SimDevices, _rng: Rng) -> End:
     devices.servo.jam()
     return devices.servo.free

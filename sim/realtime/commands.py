@@ -12,7 +12,7 @@ from sim.bench import ShelfOperator
 from sim.calibration_board import boards
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults, fault_kinds
-from sim.faults.schedule import FaultTrigger
+from sim.faults.kind import FaultTrigger
 
 HELP: Final = """\
 put NAME [DEGREES]  Put an object on the table, rotated by so many degrees (default: at random). Clears the table first.

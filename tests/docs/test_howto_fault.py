@@ -14,13 +14,11 @@ from tests.docs.pages import blocks, run
 @pytest.fixture
 def page():
     before = dict(kind.registry)
-    fault_kinds.cache_clear()
     code, test = blocks("add-a-simulated-fault")
     run(code)
     yield run(test)
     kind.registry.clear()
     kind.registry.update(before)
-    fault_kinds.cache_clear()
 
 
 def test_new_fault_happens_on_the_simulated_bench(page, tmp_path):

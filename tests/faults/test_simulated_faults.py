@@ -15,7 +15,7 @@ from sim.bench import SIM, ShelfOperator, SimOptions, open_sim_bench
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults, fault_kinds
 from sim.faults.injector import DURING_S
-from sim.faults.schedule import FaultTrigger
+from sim.faults.kind import FaultTrigger
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.faults.fault_runs import NOISE
