@@ -35,11 +35,6 @@ class SentBytes:
         """Return when the first ``count`` bytes have arrived."""
         return self.start_ns + count * BITS_PER_BYTE * 1_000_000_000 // self.baudrate
 
-    def arrived(self, now_ns: int) -> int:
-        """Return how many bytes have arrived by ``now_ns``: the largest count whose `arrival_ns` is not later."""
-        count = ((now_ns - self.start_ns + 1) * self.baudrate - 1) // (BITS_PER_BYTE * 1_000_000_000)
-        return min(max(count, 0), len(self.data))
-
     @property
     def end_ns(self) -> int:
         return self.arrival_ns(len(self.data))
@@ -88,8 +83,8 @@ class ServoBus:
     def disconnect(self) -> None:
         self._deliver = None
 
-    def send(self, data: bytes, baudrate: int) -> int:
-        """Send the host's bytes after those still being sent; return the time at which the last one arrives."""
+    def send(self, data: bytes, baudrate: int) -> None:
+        """Send the host's bytes after those still being sent."""
         frame = SentBytes(Sender.HOST, max(self.clock.now_ns(), self._sent_until_ns), baudrate, data)
         self._sent_until_ns = frame.end_ns
         for tap in self.taps:
@@ -98,7 +93,6 @@ class ServoBus:
             self._deliver(frame)
         if not self.deaf:
             self.clock.call_at(frame.end_ns, lambda: self._receive(frame))
-        return frame.end_ns
 
     def disturb(self, data: bytes, baudrate: int) -> None:
         """Send bytes to the host that no servo has sent."""
