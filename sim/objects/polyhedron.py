@@ -1,16 +1,18 @@
-"""Convex solids with flat faces: boxes, prisms, roofs, level cylinders. Each face is an affine warp of its texture."""
+"""Convex solids with flat faces: boxes, prisms, level cylinders. Each face is an affine warp of its texture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 from math import cos, pi, radians, sin, sqrt
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
-from sim.objects.layers import blend
-from sim.objects.projection import Colour, Drawing, Floats, Image, ObjectPose, Paint, nearness, shade
+from sim.objects.projection import Colour, Floats, Image, ObjectPose, Paint, nearness, shade
+from sim.objects.solid import Drawing
 
 TEXELS_PER_MM = 2.0  # as `PX_PER_MM`: finer textures would only be blurred
 _EDGE_ON = 0.004  # a face at a smaller angle is less than half a pixel wide
@@ -21,12 +23,13 @@ _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 class Face:
     """A face: its corners (k, 3) in millimetres, counter-clockwise seen from outside, and its texture or colour.
 
-    A painted face's texture spans the parallelogram of the upper left, upper right and lower left corner in ``frame``.
+    A painted face's texture spans a parallelogram: ``frame``, (3, 3), is its upper left, upper right and lower left
+    corner.
     """
 
     corners: Floats
     paint: Paint | Colour
-    frame: tuple[Floats, Floats, Floats]
+    frame: Floats
 
     @cached_property
     def printed(self) -> Image | Colour:
@@ -38,62 +41,48 @@ class Face:
         columns = round(float(np.linalg.norm(right - origin)) * TEXELS_PER_MM)
         return self.paint((rows, columns))
 
-    @cached_property
-    def normal(self) -> Floats:
-        a, b, c = self.corners[:3]
-        across = np.cross(b - a, c - a)
-        return np.asarray(across / np.linalg.norm(across))
 
-
-def quad(corners: Sequence[Sequence[float]] | Floats, paint: Paint | Colour) -> Face:
-    """Return a parallelogram from its upper left, lower left, lower right and upper right corner, seen from outside."""
+def face(corners: ArrayLike, paint: Paint | Colour) -> Face:
+    """Return a parallelogram from its upper left, lower left, lower right and upper right corner, or a triangle."""
     c = np.array(corners, dtype=np.float64)
-    return Face(c, paint, (c[0], c[3], c[1]))
-
-
-def triangle(corners: Sequence[Sequence[float]] | Floats, colour: Colour) -> Face:
-    """Return a triangle in one colour."""
-    c = np.array(corners, dtype=np.float64)
-    return Face(c, colour, (c[0], c[1], c[2]))
+    return Face(c, paint, c[[0, -1, 1]])
 
 
 @dataclass(frozen=True)
 class Polyhedron:
     """A convex solid made of faces; ``layer`` as in `sim.objects.revolution.Revolution`.
 
-    Of two parts in a layer, the one whose ``depth_at`` (x, y in the object's frame; default: the middle) is nearer to
-    the camera covers the other. That is exact if the line between these points crosses a plane between the parts at a
-    right angle.
+    It is rotated about its own axis by ``rotation_deg`` and stands at ``at`` in the object's frame. Of two parts in a
+    layer, the one whose ``depth_at`` (x, y in the object's frame; default: the middle) is nearer to the camera covers
+    the other. That is exact if the line between these points crosses a plane between the parts at a right angle.
     """
 
     faces: tuple[Face, ...]
     layer: int = 0
     depth_at: tuple[float, float] | None = None
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_deg: float = 0.0
 
     @property
     def reach_mm(self) -> float:
         """Return the radius of a circle as large as its outline seen from above."""
-        outline = cv2.convexHull(np.concatenate([face.corners[:, :2] for face in self.faces]).astype(np.float32))
+        outline = cv2.convexHull(self._geometry[0][:, :2].astype(np.float32))
         return sqrt(cv2.contourArea(outline) / pi)
 
     def drawings(self, pose: ObjectPose) -> list[Drawing]:
-        return [Drawing((self.layer, pose.depth(*self._depth_at)), partial(self._draw, pose))]
-
-    @cached_property
-    def _depth_at(self) -> tuple[float, float]:
-        if self.depth_at is not None:
-            return self.depth_at
-        x, y, _ = np.concatenate([face.corners for face in self.faces]).mean(axis=0)
-        return float(x), float(y)
+        x, y = self.depth_at or self._geometry[0].mean(axis=0)[:2].tolist()
+        return [(self.layer, pose.depth(x, y), partial(self._draw, pose))]
 
     @cached_property
     def _geometry(self) -> tuple[Floats, list[slice], Floats, Floats]:
         """All corners (n, 3), the slice of each face, the frames' points (3 m, 3), the normals (m, 3)."""
-        corners = np.concatenate([face.corners for face in self.faces])
-        ends = np.cumsum([len(face.corners) for face in self.faces])
-        frames = np.concatenate([np.stack(face.frame) for face in self.faces])
-        slices = [slice(int(end) - len(face.corners), int(end)) for face, end in zip(self.faces, ends, strict=True)]
-        return corners, slices, frames, np.array([face.normal for face in self.faces])
+        own, at = ObjectPose(self.rotation_deg), np.array(self.at)
+        corners = own.rotate(np.concatenate([face.corners for face in self.faces])) + at
+        frames = own.rotate(np.concatenate([face.frame for face in self.faces])) + at
+        ends = np.cumsum([len(face.corners) for face in self.faces]).tolist()
+        slices = [slice(start, end) for start, end in pairwise([0, *ends])]
+        across = [np.cross(b - a, c - a) for a, b, c in (corners[one][:3] for one in slices)]
+        return corners, slices, frames, np.array([each / np.linalg.norm(each) for each in across])
 
     def _draw(self, pose: ObjectPose, image: Image) -> None:
         corners_mm, slices, frames_mm, normals = self._geometry
@@ -117,7 +106,7 @@ class Polyhedron:
         cover = np.zeros((size[1], size[0]), dtype=np.uint8)
         hull = cv2.convexHull(corners.astype(np.float32)).reshape(-1, 2)
         _fill(cover, hull.astype(np.float64), (255,))
-        blend(image[top : top + size[1], left : left + size[0]], solid, cover)
+        _blend(image[top : top + size[1], left : left + size[0]], solid, cover)
 
 
 def _paint_flat(solid: Image, colour: Colour, polygon: Floats | None, light: float) -> None:
@@ -143,102 +132,60 @@ def _paint_printed(solid: Image, texture: Image, frame: Floats, polygon: Floats 
     else:
         cover = np.zeros(shaded.shape[:2], dtype=np.uint8)
         _fill(cover, polygon - (x0, y0), (255,))
-        blend(solid[y0:y1, x0:x1], shaded, cover)
+        _blend(solid[y0:y1, x0:x1], shaded, cover)
 
 
 def _fill(image: Image, polygon: Floats, colour: Sequence[float]) -> None:
     cv2.fillConvexPoly(image, np.round(polygon * (1 << _SHIFT)).astype(np.int32), colour, cv2.LINE_AA, _SHIFT)
 
 
+def _blend(below: Image, above: Image, cover: Image) -> None:
+    """Draw ``above`` over ``below`` (in place), both uint8 (h, w, 3), weighted by ``cover`` (h, w), 255 for opaque."""
+    weight = cv2.cvtColor(cover, cv2.COLOR_GRAY2BGR)
+    laid = cv2.multiply(above, weight, scale=1 / 255)
+    cv2.bitwise_not(weight, dst=weight)
+    cv2.multiply(below, weight, dst=below, scale=1 / 255)
+    cv2.add(below, laid, dst=below)
+
+
 # -- solids -----------------------------------------------------------------------------------------------------------
 
 
 def box(
-    size_mm: tuple[float, float, float],
-    walls: tuple[Paint | Colour, Paint | Colour, Paint | Colour, Paint | Colour],
-    *,
-    top: Paint | Colour,
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    rotation_deg: float = 0.0,
-    layer: int = 0,
+    size_mm: tuple[float, float, float], walls: Sequence[Paint | Colour], *, top: Paint | Colour, **placing: Any
 ) -> Polyhedron:
-    """Return a box (width, depth, height) at ``at``, rotated about its own axis, without a bottom.
-
-    The ``walls`` are front, right, back and left.
-    """
+    """Return a box (width, depth, height) without a bottom; the ``walls`` are front, right, back and left."""
     w, d, h = size_mm[0] / 2, size_mm[1] / 2, size_mm[2]
-    ring = [(-w, -d), (w, -d), (w, d), (-w, d)]
-    sides = [
-        quad([(*ring[i], h), (*ring[i], 0), (*ring[(i + 1) % 4], 0), (*ring[(i + 1) % 4], h)], paint)
-        for i, paint in enumerate(walls)
-    ]
-    lid = quad([(-w, d, h), (-w, -d, h), (w, -d, h), (w, d, h)], top)
-    return moved(Polyhedron((*sides, lid), layer), at, rotation_deg)
+    ring = [(-w, -d), (w, -d), (w, d), (-w, d), (-w, -d)]
+    lid = face([(-w, d, h), (-w, -d, h), (w, -d, h), (w, d, h)], top)
+    return Polyhedron((*_upright(ring, h, walls), lid), **placing)
 
 
-def prism(sides: int, radius_mm: float, height_mm: float, *, wall: Paint | Colour, top: Paint | Colour) -> Polyhedron:
+def prism(
+    sides: int, radius_mm: float, height_mm: float, *, wall: Paint | Colour, top: Colour, **placing: Any
+) -> Polyhedron:
     """Return an upright prism over a regular polygon with a face to the front; all walls have the same print."""
-    ring = [
-        (radius_mm * cos(a), radius_mm * sin(a))
-        for a in (radians(-90) + (2 * i - 1) * pi / sides for i in range(sides + 1))
-    ]
-    walls = [quad([(*a, height_mm), (*a, 0), (*b, 0), (*b, height_mm)], wall) for a, b in pairwise(ring)]
-    lid = np.array([(*p, height_mm) for p in ring[:-1]])
-    r, z = radius_mm, height_mm
-    return Polyhedron((*walls, Face(lid, top, (np.array([-r, r, z]), np.array([r, r, z]), np.array([-r, -r, z])))))
+    angles = [radians(-90) + (2 * i - 1) * pi / sides for i in range(sides + 1)]
+    ring = [(radius_mm * cos(a), radius_mm * sin(a)) for a in angles]
+    lid = face([(*p, height_mm) for p in ring[:-1]], top)
+    return Polyhedron((*_upright(ring, height_mm, [wall] * sides), lid), **placing)
+
+
+def _upright(ring: Sequence[tuple[float, float]], h: float, walls: Sequence[Paint | Colour]) -> list[Face]:
+    """Return the walls over a closed outline (x, y), counter-clockwise, whose last point is its first."""
+    pieces = zip(pairwise(ring), walls, strict=True)
+    return [face([(*a, h), (*a, 0), (*b, 0), (*b, h)], paint) for (a, b), paint in pieces]
 
 
 def lying_cylinder(
-    radius_mm: float,
-    length_mm: float,
-    *,
-    wall: Colour,
-    end: Paint | Colour,
-    at: tuple[float, float, float],
-    rotation_deg: float = 0.0,
-    depth_at: tuple[float, float] | None = None,
+    radius_mm: float, length_mm: float, *, wall: Colour, end: Paint | Colour, **placing: Any
 ) -> Polyhedron:
-    """Return a horizontal cylinder with its printed end to the front and its back end at ``at``."""
-    sides = 36
-    ring = [(radius_mm * cos(2 * pi * i / sides), radius_mm * sin(2 * pi * i / sides)) for i in range(sides + 1)]
-    y = -length_mm
+    """Return a horizontal cylinder with its printed end to the front and its back end at the object's place."""
+    sides, r, y = 36, radius_mm, -length_mm
+    ring = [(r * cos(2 * pi * i / sides), r * sin(2 * pi * i / sides)) for i in range(sides + 1)]
     walls = [
-        quad([(a[0], 0, a[1]), (b[0], 0, b[1]), (b[0], y, b[1]), (a[0], y, a[1])], wall) for a, b in pairwise(ring)
+        face([(a[0], 0, a[1]), (b[0], 0, b[1]), (b[0], y, b[1]), (a[0], y, a[1])], wall) for a, b in pairwise(ring)
     ]
-    r = radius_mm
-    near = np.array([(x, y, z) for x, z in ring[:-1]])
-    far = np.array([(x, 0.0, z) for x, z in ring[:-1]])[::-1].copy()
-    lid = Face(near, end, (np.array([-r, y, r]), np.array([r, y, r]), np.array([-r, y, -r])))
-    cap = Face(far, wall, (far[0], far[1], far[2]))
-    return moved(Polyhedron((*walls, lid, cap), 0, depth_at), at, rotation_deg)
-
-
-def roof(
-    size_mm: tuple[float, float, float], *, slope: Paint, gable: Colour, at: tuple[float, float, float]
-) -> Polyhedron:
-    """Return a gabled roof (width, depth, height) whose ridge runs from left to right."""
-    w, d, h = size_mm[0] / 2, size_mm[1] / 2, size_mm[2]
-    a, b, c, e = (-w, -d, 0.0), (w, -d, 0.0), (w, d, 0.0), (-w, d, 0.0)
-    left, right = (-w, 0.0, h), (w, 0.0, h)
-    triangles = [np.array(t, dtype=np.float64) for t in ((e, a, left), (b, c, right))]
-    faces = (
-        quad([left, a, b, right], slope),
-        quad([right, c, e, left], slope),
-        *(Face(t, gable, (t[0], t[1], t[2])) for t in triangles),
-    )
-    return moved(Polyhedron(faces, 1), at, 0.0)
-
-
-def moved(solid: Polyhedron, at: tuple[float, float, float], rotation_deg: float) -> Polyhedron:
-    """Return ``solid`` rotated about its own axis and moved to ``at`` in the object's frame."""
-    pose = ObjectPose(rotation_deg)
-
-    def placed(points: Floats) -> Floats:
-        return np.asarray(pose.rotate(points) + np.array(at))
-
-    faces = tuple(Face(placed(f.corners), f.paint, _three(placed(np.array(f.frame)))) for f in solid.faces)
-    return Polyhedron(faces, solid.layer, solid.depth_at)
-
-
-def _three(points: Floats) -> tuple[Floats, Floats, Floats]:
-    return points[0], points[1], points[2]
+    lid = Face(np.array([(x, y, z) for x, z in ring[:-1]]), end, np.array([(-r, y, r), (r, y, r), (-r, y, -r)]))
+    back = face([(x, 0.0, z) for x, z in ring[-2::-1]], wall)
+    return Polyhedron((*walls, lid, back), **placing)

@@ -9,7 +9,7 @@ platter's centre, as through a long lens.
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import cos, hypot, radians, sin
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +48,6 @@ class Visible(Protocol):
         ``azimuth_deg`` is the object's counter-clockwise rotation seen from above; ``offset_mm`` is the position of its
         axis in the room.
         """
-
-
-class Drawing(NamedTuple):
-    """One step of drawing; the lowest ``order`` (layer, then nearness to the camera) is drawn first."""
-
-    order: tuple[int, float]
-    onto: Callable[[Image], None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.objects.curves import Curve, evenly
-from sim.objects.layers import place
-from sim.objects.projection import COS, PX_PER_MM, SIN, Colour, Drawing, Floats, Image, ObjectPose, Paint, gloss, shade
+from sim.objects.projection import COS, PX_PER_MM, SIN, Colour, Floats, Image, ObjectPose, Paint, gloss, shade
+from sim.objects.solid import Curve, Drawing, evenly, place
 
 TEXELS_PER_MM = 2.0
 _STEP_MM = 0.25  # half a pixel along the outline
@@ -47,7 +46,7 @@ class Revolution:
 
     def drawings(self, pose: ObjectPose) -> list[Drawing]:
         foot_px = pose.to_image(np.array([[*self.at, 0.0]]))[0]
-        return [Drawing((self.layer, pose.depth(*self.at)), partial(self._draw, pose.azimuth_deg, foot_px))]
+        return [(self.layer, pose.depth(*self.at), partial(self._draw, pose.azimuth_deg, foot_px))]
 
     @property
     def reach_mm(self) -> float:

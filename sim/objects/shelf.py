@@ -8,12 +8,13 @@ from math import cos, pi, sin
 from types import MappingProxyType
 from typing import Any
 
-from sim.objects.curves import Curve, smooth
+import numpy as np
+
 from sim.objects.paint import painted
-from sim.objects.polyhedron import Face, Polyhedron, box, lying_cylinder, prism, quad, roof, triangle
+from sim.objects.polyhedron import Polyhedron, box, face, lying_cylinder, prism
 from sim.objects.projection import Colour, Paint
 from sim.objects.revolution import Revolution
-from sim.objects.solid import Part, Solid
+from sim.objects.solid import Curve, Part, Solid
 from sim.objects.tube import Tube, handle, ray
 
 CONFUSABLE: tuple[tuple[str, str], ...] = (
@@ -94,9 +95,9 @@ def _part(table: Table, paints: Mapping[str, Paint], colours: Mapping[str, Colou
 
     read: dict[str, Callable[[Any], Any]] = {
         **dict.fromkeys(("profile", "inside", "path"), _curve),
-        **dict.fromkeys(("paint", "top", "wall", "end", "slope", "gable", "colour", "lining"), paint),
+        **dict.fromkeys(("paint", "top", "wall", "end", "colour", "lining"), paint),
         "walls": lambda walls: tuple(paint(wall) for wall in walls),
-        "faces": lambda faces: tuple(_face(face["corners"], paint(face["paint"])) for face in faces),
+        "faces": lambda faces: tuple(face(one["corners"], paint(one["paint"])) for one in faces),
     }
     values = {key: read.get(key, _plain)(value) for key, value in table.items()}
     shape: Part = _SHAPES[values.pop("shape")](**values)
@@ -111,19 +112,26 @@ def _revolution(paint: Paint | Colour, **values: Any) -> Revolution:
     return Revolution(paint=painted(paint) if isinstance(paint, tuple) else paint, **values)
 
 
-def _face(corners: list[list[float]], paint: Any) -> Face:
-    return triangle(corners, paint) if len(corners) == 3 else quad(corners, paint)
-
-
 _SHAPES: dict[str, Callable[..., Part]] = {
     "revolution": _revolution,
     "tube": Tube,
     "box": box,
     "prism": prism,
     "lying_cylinder": lying_cylinder,
-    "roof": roof,
     "faces": Polyhedron,
 }
+
+
+_ROUNDS = 4  # each round doubles the points: 16 for each corner
+
+
+def smooth(*corners: tuple[float, ...]) -> Curve:
+    """Return the curve through ``corners`` with rounded edges (Chaikin's corner cutting); its ends do not move."""
+    points = np.array(corners, dtype=np.float64)
+    for _ in range(_ROUNDS):
+        cut = np.stack([0.75 * points[:-1] + 0.25 * points[1:], 0.25 * points[:-1] + 0.75 * points[1:]], axis=1)
+        points = np.concatenate([points[:1], cut.reshape(-1, points.shape[1]), points[-1:]])
+    return tuple(tuple(float(x) for x in point) for point in points)
 
 
 def _curve(pieces: list[Any]) -> Curve:

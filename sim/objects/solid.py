@@ -1,5 +1,6 @@
-"""An object made of parts on the platter."""
+"""An object made of parts on the platter, and what draws its parts."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Protocol
@@ -7,9 +8,13 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from sim.objects.layers import place
-from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Drawing, Floats, Image, ObjectPose
+from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Floats, Image, ObjectPose
 from sim.table import TABLE
+
+Curve = tuple[tuple[float, ...], ...]
+"""Points, each a tuple of numbers, such as (radius, height) or (x, y, z, thickness)."""
+Drawing = tuple[int, float, Callable[[Image], None]]
+"""A step of drawing: layer, nearness to the camera, and the function that draws. The lowest are drawn first."""
 
 
 class Part(Protocol):
@@ -39,8 +44,8 @@ class Solid:
         clear, foot = self._shadow
         place(image, np.zeros_like(clear), clear, pose.to_image(np.zeros((1, 3)))[0] - foot)
         drawings = [drawing for part in self.parts for drawing in part.drawings(pose)]
-        for drawing in sorted(drawings, key=lambda d: d.order):
-            drawing.onto(image)
+        for _, _, draw_onto in sorted(drawings, key=lambda drawing: drawing[:2]):
+            draw_onto(image)
 
     @cached_property
     def _shadow(self) -> tuple[Image, Floats]:
@@ -73,3 +78,38 @@ def _empty_platter() -> Image:
         for step in range(thickness if down else 1):
             cv2.ellipse(image, (x, y + down - step), axes, 0, 0, 360, colour, -1, cv2.LINE_AA)
     return image
+
+
+def evenly(curve: Curve, step: float, *, dimensions: int) -> Floats:
+    """Return ``curve`` resampled at steps of about ``step``, (n, d); the first ``dimensions`` numbers are positions."""
+    points = np.array(curve, dtype=np.float64)
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :dimensions], axis=0), axis=1))])
+    even = np.linspace(0.0, s[-1], max(int(np.ceil(s[-1] / step)), 1) + 1)
+    return np.column_stack([np.interp(even, s, column) for column in points.T])
+
+
+def place(image: Image, seen: Image, clear: Image, corner_px: Floats) -> None:
+    """Draw ``seen``, already weighted by its cover, on ``image``, at a position that may be between pixels.
+
+    They are uint8 (H, W, 3) and (h, w, 3); ``clear``, (h, w, 3), is the weight of the image below, 255 outside
+    ``seen``. ``corner_px`` is the position (x, y) of the upper left pixel's centre in the image.
+    """
+    x, y = (int(c) for c in np.floor(corner_px))
+    right, down = float(corner_px[0] - x), float(corner_px[1] - y)
+    if right or down:
+        seen, clear = _shifted(seen, right, down, 0), _shifted(clear, right, down, 255)
+    left, top = max(x, 0), max(y, 0)
+    end, bottom = min(x + seen.shape[1], image.shape[1]), min(y + seen.shape[0], image.shape[0])
+    if left >= end or top >= bottom:
+        return
+    part = np.s_[top - y : bottom - y, left - x : end - x]
+    below = image[top:bottom, left:end]
+    cv2.multiply(below, clear[part], dst=below, scale=1 / 255)
+    cv2.add(below, seen[part], dst=below)
+
+
+def _shifted(plane: Image, right: float, down: float, beyond: int) -> Image:
+    """Return ``plane`` moved by less than a pixel, bilinear, one pixel larger; new pixels are ``beyond``."""
+    wide = cv2.copyMakeBorder(plane, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(beyond, beyond, beyond))
+    across = cv2.addWeighted(wide[:, 1:], 1 - right, wide[:, :-1], right, 0)
+    return np.asarray(cv2.addWeighted(across[1:], 1 - down, across[:-1], down, 0), dtype=np.uint8)

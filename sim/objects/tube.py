@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.objects.curves import Curve, evenly
-from sim.objects.projection import COS, PX_PER_MM, SIN, TO_LIGHT, Colour, Drawing, Floats, Image, ObjectPose, nearness
+from sim.objects.projection import COS, PX_PER_MM, SIN, TO_LIGHT, Colour, Floats, Image, ObjectPose, nearness
+from sim.objects.solid import Curve, Drawing, evenly
 
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 _STEP_MM = 4.0  # eight pixels: shorter pieces are not seen on a bent wire
@@ -46,7 +46,7 @@ class Tube:
         segments = np.arange(len(points) - 1)
         if self.joints == 0:
             x, y = points[:, :2].mean(axis=0).tolist()
-            return [Drawing((self.layer, pose.depth(x, y)), partial(self._draw, pose, points, segments))]
+            return [(self.layer, pose.depth(x, y), partial(self._draw, pose, points, segments))]
         cuts = [radius * (1 - pose.facing(x, y)) for x, y, _, radius in points[[0, -1]].tolist()]
         even = np.linspace(cuts[0], length[-1] - (cuts[1] if self.joints == 2 else 0.0), len(points))
         trimmed = np.column_stack([np.interp(even, length, column) for column in points.T])
@@ -54,10 +54,10 @@ class Tube:
         depth = (depth[1:] + depth[:-1]) / 2
         before = depth > _EDGE_ON_MM
         joint = (length[:-1] < 2 * points[0, 3]) | (length[1:] > length[-1] - 2 * points[-1, 3])
-        drawings = [Drawing((self.layer, -_FAR_MM), partial(self._draw, pose, points, segments[~before | joint]))]
+        drawings: list[Drawing] = [(self.layer, -_FAR_MM, partial(self._draw, pose, points, segments[~before | joint]))]
         if before.any():
             nearer = float(depth[before].mean()) + pose.depth(0.0, 0.0)
-            drawings.append(Drawing((self.layer, nearer), partial(self._draw, pose, trimmed, segments[before])))
+            drawings.append((self.layer, nearer, partial(self._draw, pose, trimmed, segments[before])))
         return drawings
 
     @cached_property
