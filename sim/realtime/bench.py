@@ -20,7 +20,7 @@ from rig.core.next_steps import Do
 from rig.devices.camera import Capture
 from rig.devices.dynamixel.port import SerialConnection
 from rig.safety.saved_state import holder
-from sim.camera import CAMERA_DEVICE
+from sim.camera import CAMERA_DEVICE, SELECT_S
 from sim.i2c import KernelBus, Messages
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, Wire, not_running
 
@@ -33,56 +33,54 @@ class RemoteCapture(Capture):
 
     def __init__(self, folder: Path) -> None:
         self._wire = Wire(folder)
-        answer = self._ask("open")[0]
-        if not answer.get("ok"):
+        if (answer := self._ask("open")) != "open":
             self.release()
-            raise DeviceNotFound(
-                "Cannot open the simulated camera.",
-                next_step="Close the program that uses it." if answer.get("busy") else "Connect the camera.",
-            )
+            step = "Close the program that uses it." if answer == "busy" else "Connect the camera."
+            raise DeviceNotFound("Cannot open the simulated camera.", next_step=step)
 
     def isOpened(self) -> bool:  # noqa: N802
-        return bool(self._ask("isOpened")[0].get("ok"))
-
-    def grab(self) -> bool:
-        return bool(self._ask("grab")[0].get("ok"))
+        return bool(self._ask("isOpened"))
 
     def wait(self, seconds: float) -> bool:
         """Wait for a frame for at most this time; return whether `grab` then returns at once."""
-        answer = self._ask("wait", seconds=seconds)[0]
-        return bool(answer.get("ok", True))  # `grab` fails if the simulated bench has ended
+        return self._ask("wait", seconds) is not False  # None: the simulated bench has ended, so `grab` fails
+
+    def grab(self) -> bool:
+        return self.wait(SELECT_S) and bool(self._ask("grab"))
 
     def retrieve(self) -> tuple[bool, Any]:
-        answer, pixels = self._ask("retrieve")
-        if not answer.get("ok"):
+        shape = self._ask("retrieve")
+        if shape is None:
             return False, None
-        return True, np.frombuffer(bytearray(pixels), dtype=np.uint8).reshape(answer["shape"])
+        return True, np.frombuffer(bytearray(self._pixels), dtype=np.uint8).reshape(shape)
 
     def get(self, propId: int, /) -> float:
-        return float(self._ask("get", property=propId)[0].get("value", 0.0))
+        return float(self._ask("get", propId) or 0.0)
 
     def set(self, propId: int, value: float, /) -> bool:
-        return bool(self._ask("set", property=propId, value=value)[0].get("ok"))
+        return bool(self._ask("set", propId, value))
 
     def release(self) -> None:
         self._ask("release")  # when it has returned, another program can open the camera
         self._wire.close()
 
-    def _ask(self, call: str, **values: Any) -> tuple[dict[str, Any], bytes]:
+    def _ask(self, call: str, *given: float) -> Any:
+        """Return the value of a call; None if the simulated bench has ended, or the camera is closed."""
         try:
-            return self._wire.ask(ask="camera", call=call, **values)
-        except (OSError, ValueError):  # the simulated bench has ended, or the camera is closed
-            return {}, b""
+            answer, self._pixels = self._wire.ask(ask="camera", call=call, given=given)
+        except (OSError, ValueError):
+            return None
+        return answer["value"]
 
 
 def camera_node(folder: Path) -> tuple[int, ...] | None:
     """Return the identity of the device file of the simulated bench's camera; None if it is unplugged."""
     try:
         with closing(Wire(folder)) as wire:
-            node = wire.ask(ask="camera", call="node")[0].get("node")
+            node = wire.ask(ask="camera", call="node", given=[])[0]["value"]
     except (DeviceNotFound, OSError, ValueError):
         return None
-    return None if node is None else (int(node),)
+    return node and tuple(node)
 
 
 class RemoteI2c(KernelBus):

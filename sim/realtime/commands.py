@@ -13,6 +13,7 @@ from sim.calibration_board import boards
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults, fault_kinds
 from sim.faults.kind import FaultTrigger
+from sim.head.board import SimHead
 
 HELP: Final = """\
 put NAME [DEGREES]  Put an object on the table, rotated by so many degrees (default: at random). Clears the table first.
@@ -28,6 +29,7 @@ end [FAULT]         End a simulated fault; without a name, all. For example: end
 faults              List the simulated faults.
 status              Show the world as it really is.
 quit                End the simulated bench."""
+_USAGE: Final = {line.split()[0]: line.split("  ")[0] for line in HELP.splitlines()}
 
 MAX_LIGHT: Final = 10.0  # brighter than any lamp that a simulated bench needs
 MAX_DEG: Final = 3600.0  # ten revolutions: more only takes long
@@ -47,48 +49,66 @@ class Commands:
         self._world = devices.world
         self._faults = faults
 
+    def answer(self, words: Sequence[str]) -> dict[str, Any]:
+        """Carry out a command; return the result, or the error, as plain data with the state of the world."""
+        try:
+            return {"text": self.do(words), "world": self.state()}
+        except RigError as error:
+            return {"failed": plain(error.problem), "world": self.state()}
+
     def do(self, words: Sequence[str]) -> str:
         """Carry out a command, and return the result in words.
 
         Raises `UsageError`, `ObjectNotFound`: there is no such command, object or fault, or it is not possible now.
         """
-        command, *given = words or ["help"]
-        match command:
-            case "put":
-                return self._put(*_arguments(command, given, 1, 2))
-            case "clear":
-                _arguments(command, given)
+        match words:
+            case [] | ["help"]:
+                return HELP
+            case ["put", name]:
+                return self._put(name, None)
+            case ["put", name, angle]:
+                return self._put(name, _number(angle, "degrees", MAX_DEG))
+            case ["clear"]:
                 self._world.put(None)
                 return "The table is empty."
-            case "objects":
+            case ["objects"]:
                 return "\n".join([*self._operator.objects, *boards(self._operator.optics)])
-            case "rotate":
-                return self._rotate_by_hand(_number(_arguments(command, given, 1, 1)[0], "degrees", MAX_DEG))
-            case "light":
-                factor = _number(_arguments(command, given, 1, 1)[0], "factor", MAX_LIGHT)
+            case ["rotate", angle]:
+                return self._rotate_by_hand(_number(angle, "degrees", MAX_DEG))
+            case ["light", level]:
+                factor = _number(level, "factor", MAX_LIGHT)
                 if factor < 0:
                     raise UsageError("The light cannot be negative.", next_step="Give 0 (dark) or more.")
                 self._world.change(light=(factor,) * 3)
                 return f"The light is at {percent(factor, 0)}."
-            case "power-cycle":
-                _arguments(command, given)
+            case ["power-cycle"]:
                 self._devices.servo.power_cycle()
                 return "The servo's supply was off for a moment."
-            case "estop" | "head":
-                return self._head(command, *_arguments(command, given, 1, 1))
-            case "end":
-                return self._end(*_arguments(command, given, 0, 1))
-            case "faults":
+            case ["estop", "press" | "release" as action]:
+                self._head().estop_open = action == "press"
+                return f"The emergency stop is {'pressed' if action == 'press' else 'released'}."
+            case ["head", "unplug" | "plug" as action]:
+                self._head().unplugged = action == "unplug"
+                return f"The rig head is {action}ged{' in' if action == 'plug' else ''}."
+            case ["end"]:
+                self._faults.clear()
+                return "No simulated fault is left."
+            case ["end", name]:
+                return self._end(name)
+            case ["faults"]:
                 return "\n".join(f"{kind.name:18} {kind.what}" for kind in fault_kinds().values())
-            case "status":
-                _arguments(command, given)
-                return self._describe()
-            case "quit":
+            case ["status"]:
+                now = self.state()
+                return (
+                    f"On the table: {now['object'] or 'nothing'}. The table is at {angle_words(now['table_deg'])}, its "
+                    f"torque {'on' if now['torque'] else 'off'}. Faults: {', '.join(now['faults']) or 'none'}."
+                )
+            case ["quit"]:
                 self.ended = True
                 return "The simulated bench ends."
-            case "help":
-                return HELP
-        return self._begin(command, given)
+            case [command, *_] if command in _USAGE:
+                raise UsageError(f"{command!r} does not take these words.", next_step=f"Write: {_USAGE[command]}")
+        return self._begin(" ".join(words))
 
     def state(self) -> dict[str, Any]:
         """Return the true state of the world as plain data."""
@@ -102,16 +122,15 @@ class Commands:
             "faults": [fault.kind.name for fault in self._faults.active],
         }
 
-    def _put(self, name: str, angle: str | None = None) -> str:
+    def _put(self, name: str, yaw_deg: float | None) -> str:
         operator = self._operator
-        operator.yaw_deg = None if angle is None else _number(angle, "degrees", MAX_DEG)
         if name not in {*operator.objects, *boards(operator.optics)}:
             raise UsageError(
                 f"There is no object {name!r}.",
                 next_step="Choose a listed object. To list them: objects",
                 evidence={"objects": list(operator.objects)},
             )
-        operator.next_object = name
+        operator.next_object, operator.yaw_deg = name, yaw_deg
         operator.place(None)
         return f"{name} is on the table."
 
@@ -122,30 +141,20 @@ class Commands:
             raise UsageError("The servo holds the table.", next_step=Do.STOP()) from held
         return f"The table is rotated by {angle_words(angle_deg, None)} by hand, in {seconds:.1f} s."
 
-    def _head(self, part: str, action: str) -> str:
-        head = self._devices.head
-        if head is None:
+    def _head(self) -> SimHead:
+        if self._devices.head is None:
             step = Do.SIM_BENCH(set="imu.connection=head")
             raise UsageError("This bench has no rig head.", next_step=step)
-        match part, action:
-            case "estop", "press" | "release":
-                head.estop_open = action == "press"
-                return f"The emergency stop is {'pressed' if head.estop_open else 'released'}."
-            case "head", "unplug" | "plug":
-                head.unplugged = action == "unplug"
-                return f"The rig head is {'unplugged' if head.unplugged else 'plugged in'}."
-        words = "estop press or estop release" if part == "estop" else "head unplug or head plug"
-        raise UsageError(f"{part!r} does not know {action!r}.", next_step=f"Write {words}.")
+        return self._devices.head
 
-    def _begin(self, command: str, given: list[str]) -> str:
+    def _begin(self, text: str) -> str:
         try:
-            fault = Fault.parse(command)
+            fault = Fault.parse(text)
         except UsageError as error:
             raise UsageError(
-                f"There is no command or fault {command!r}.",
+                f"There is no command or fault {text!r}.",
                 next_step=(*error.steps, "For a list of all commands: rig sim-bench help"),
             ) from error
-        _arguments(command, given)
         name = fault.kind.name
         if name in _OF_ONE_PROGRAM:
             raise UsageError(
@@ -160,10 +169,7 @@ class Commands:
         self._faults.schedule(replace(fault, mark=fault.mark + self._world.clock.now_ns() * 1e-9))
         return f"{fault.kind.what} To end it: end {name}"
 
-    def _end(self, name: str | None = None) -> str:
-        if name is None:
-            self._faults.clear()
-            return "No simulated fault is left."
+    def _end(self, name: str) -> str:
         if not self._faults.end(name):
             active = ", ".join(fault.kind.name for fault in self._faults.active)
             raise UsageError(
@@ -171,28 +177,6 @@ class Commands:
                 next_step=f"End one of: {active}" if active else "No simulated fault is there.",
             )
         return f"The fault {name} has ended."
-
-    def _describe(self) -> str:
-        now = self.state()
-        return (
-            f"On the table: {now['object'] or 'nothing'}. The table is at {angle_words(now['table_deg'])}, its torque "
-            f"{'on' if now['torque'] else 'off'}. Faults: {', '.join(now['faults']) or 'none'}."
-        )
-
-
-def run(commands: Commands, words: Sequence[str]) -> dict[str, Any]:
-    """Carry out a command; return the result, or the error, as plain data with the state of the world."""
-    try:
-        return {"text": commands.do(words), "world": commands.state()}
-    except RigError as error:
-        return {"failed": plain(error.problem), "world": commands.state()}
-
-
-def _arguments(command: str, given: list[str], least: int = 0, most: int = 0) -> list[str]:
-    if least <= len(given) <= most:
-        return given
-    usage = next((line.split("  ")[0] for line in HELP.splitlines() if line.startswith(command)), command)
-    raise UsageError(f"{command!r} does not take {len(given)} words.", next_step=f"Write: {usage}")
 
 
 def _number(text: str, meaning: str, largest: float) -> float:

@@ -7,7 +7,6 @@ A request is one line of JSON. The answer is also one line of JSON, followed by 
 import json
 import socket
 import socketserver
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +18,7 @@ from rig.core.files import json_values
 from sim.camera import SELECT_S
 from sim.devices import SimDevices
 from sim.i2c import SimI2cBus
-from sim.realtime.commands import Commands, run
+from sim.realtime.commands import Commands
 from sim.realtime.pace import RealTime
 from sim.realtime.wire import SOCKET, short_path
 
@@ -46,21 +45,16 @@ class ClientSession:
         match request:
             case {"ask": "do", "words": [*words]} if all(isinstance(word, str) for word in words):
                 with self._time.present():
-                    answer = run(self._bench.commands, words)
+                    answer = self._bench.commands.answer(words)
                 with self._time.present():  # a port that was unplugged has disappeared before the answer
                     return answer, b""
             case {"ask": "i2c", "messages": [*messages]}:
                 return self._i2c(messages)
-            case {"ask": "camera", "call": "open"}:
-                return self._open_camera(), b""
-            case {"ask": "camera", "call": "node"}:
+            case {"ask": "camera", "call": "wait", "given": [int() | float() as seconds]} if seconds >= 0:
+                return {"value": self._wait(min(seconds, SELECT_S))}, b""
+            case {"ask": "camera", "call": str(call), "given": [*given]}:
                 with self._time.present():
-                    node = self._devices.camera.node()
-                return {"node": None if node is None else node[0]}, b""
-            case {"ask": "camera", "call": str(call), **rest}:
-                if self._bench.camera_user is not self:
-                    return {"ok": False}, b""
-                return self._camera(call, rest)
+                    return self._camera(call, given)
         raise InvalidRequest
 
     def close(self) -> None:
@@ -72,48 +66,40 @@ class ClientSession:
 
     # -- camera -----------------------------------------------------------------------------------------------------
 
-    def _open_camera(self) -> dict[str, Any]:
-        with self._time.present():
-            if self._bench.camera_user not in (None, self):
-                return {"ok": False, "busy": True}
-            if not self._devices.camera.reopen():
-                return {"ok": False, "busy": False}
-            self._bench.camera_user = self
-            return {"ok": True}
-
-    def _camera(self, call: str, rest: Mapping[object, Any]) -> Answer:
-        camera = self._devices.camera
-        match call, rest:
-            case "grab", {}:
-                return {"ok": self._grab()}, b""
-            case "wait", {"seconds": int() | float() as seconds} if seconds >= 0:
-                return {"ok": self._wait(min(seconds, SELECT_S))}, b""
-        if call == "release":
-            self.close()
-            return {"ok": True}, b""
-        with self._time.present():
-            match call, rest:
-                case "isOpened", {}:
-                    return {"ok": camera.isOpened()}, b""
-                case "retrieve", {}:
-                    ok, image = camera.retrieve()
-                    if image is None:
-                        return {"ok": False}, b""
-                    return {"ok": ok, "shape": image.shape}, image.tobytes()
-                case "get", {"property": int(number)}:
-                    value = camera.get(number)
-                    if number == cv2.CAP_PROP_POS_MSEC and value > 0:
-                        value = self._time.system_ns(round(value * 1e6)) * 1e-6
-                    return {"value": value}, b""
-                case "set", {"property": int(number), "value": int() | float() as value}:
-                    return {"ok": camera.set(number, value)}, b""
-        raise InvalidRequest
-
-    def _grab(self) -> bool:
-        if not self._wait(SELECT_S):
-            return False
-        with self._time.present():
-            return self._devices.camera.grab()
+    def _camera(self, call: str, given: list[Any]) -> Answer:
+        """Return the value of a call; None for the calls of a program that has not opened the camera."""
+        camera, bench = self._devices.camera, self._bench
+        value: object = None
+        match call, given:
+            case "node", []:
+                value = camera.node()
+            case "open", [] if bench.camera_user not in (None, self):
+                value = "busy"
+            case "open", []:
+                value = "open" if camera.reopen() else "unplugged"
+                bench.camera_user = self if value == "open" else None
+            case _ if bench.camera_user is not self:
+                pass
+            case "release", []:
+                self.close()
+            case "isOpened", []:
+                value = camera.isOpened()
+            case "grab", []:
+                value = not camera.wait_ns() and camera.grab()  # it must not wait here, where it would hold the world
+            case "retrieve", []:
+                _, image = camera.retrieve()
+                if image is not None:
+                    return {"value": image.shape}, image.tobytes()
+            case "get", [cv2.CAP_PROP_POS_MSEC]:
+                stamp_ms = camera.get(cv2.CAP_PROP_POS_MSEC)
+                value = self._time.system_ns(round(stamp_ms * 1e6)) * 1e-6 if stamp_ms > 0 else stamp_ms
+            case "get", [int() as number]:
+                value = camera.get(number)
+            case "set", [int() as number, int() | float() as wanted]:
+                value = camera.set(number, wanted)
+            case _:
+                raise InvalidRequest
+        return {"value": value}, b""
 
     def _wait(self, seconds: float) -> bool:
         """Wait for the next frame, without holding the world meanwhile; return whether it is there."""

@@ -287,8 +287,11 @@ REQUESTS = st.one_of(
     ANYTHING,
     st.fixed_dictionaries({"ask": st.just("do"), "words": st.lists(st.sampled_from(HELP.split()), max_size=4)}),
     st.fixed_dictionaries(
-        {"ask": st.just("camera"), "call": st.sampled_from(["open", "isOpened", "get", "set", "retrieve"])},
-        optional={"property": st.integers() | ANYTHING, "value": st.floats() | ANYTHING},
+        {
+            "ask": st.just("camera"),
+            "call": st.sampled_from(["open", "node", "isOpened", "get", "set", "grab", "retrieve", "release"]),
+            "given": st.lists(st.integers() | st.floats() | ANYTHING, max_size=2),
+        },
     ),
     st.fixed_dictionaries(
         {
@@ -312,7 +315,7 @@ def session(tmp_path_factory) -> Iterator[ClientSession]:
 @given(request_=REQUESTS)
 @example(request_={"ask": "i2c", "messages": [[0x68, 10**12]]})
 @example(request_={"ask": "i2c", "messages": [[0x68, "00"], [0x68, 8]]})
-@example(request_={"ask": "camera", "call": "set", "property": 10**30, "value": 1e999})
+@example(request_={"ask": "camera", "call": "set", "given": [10**30, 1e999]})
 @example(request_={"ask": "do", "words": []})
 def test_any_request_is_answered_or_rejected(session, request_):
     try:
