@@ -7,7 +7,7 @@ from dataclasses import fields
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from rig.bench import Bench, BenchKind
 from rig.bench.bench import DEVICES
@@ -65,13 +65,15 @@ class SimOptions(Section):
 
     @field_validator("noise")
     @classmethod
-    def _known(cls, values: dict[str, Any]) -> dict[str, Any]:
+    def _possible(cls, values: dict[str, Any]) -> dict[str, Any]:
         known = [f.name for f in fields(NoiseModel)]
-        unknown = sorted(set(values) - set(known))
-        if unknown:
+        if unknown := sorted(set(values) - set(known)):
             raise ValueError(f"unknown: {', '.join(unknown)}; there are {', '.join(known)}")
-        values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-        NoiseModel(**values)  # checks the ranges
+        try:
+            NoiseModel(**values)
+        except ValidationError as error:
+            mistake = error.errors()[0]
+            raise ValueError(": ".join([*map(str, mistake["loc"][:1]), mistake["msg"]])) from None
         return values
 
 

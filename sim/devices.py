@@ -21,7 +21,6 @@ from sim.objects.projection import Image
 from sim.objects.shelf import shelf
 from sim.servo import ServoBus, SimSerial
 from sim.servo.device import SimServo
-from sim.servo.shaft import Geared, Shaft
 from sim.world import SimObject, World
 
 
@@ -30,9 +29,8 @@ def simulated_servo(world: World, config: ServoConfig) -> SimServo:
 
     Raises `ConfigError` if there is no simulated servo of that model, or the model does not have the baud rate.
     """
-    shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
     try:
-        return SimServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
+        return SimServo(world, config.model, bus_id=config.id, baudrate=config.baud, gear_ratio=config.gear_ratio)
     except ValueError as error:
         raise ConfigError(
             "The simulated bench has no such servo.",

@@ -1,11 +1,11 @@
 """The bench of photographs: a simulated bench whose camera shows photographs of real objects from known angles."""
 
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -15,20 +15,67 @@ from rig.catalog.exchange.photographs import DEFAULT_PATTERN, Photographs, read_
 from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.clock import SystemClock
-from rig.core.errors import ConfigError, ImportRejected, ObjectNotFound, UsageError
+from rig.core.errors import ConfigError, ImportRejected, UsageError
 from rig.core.next_steps import Do
 from rig.core.phrases import counted
-from rig.views.image_files import Header, header, read_file
+from rig.views.image_files import BadImage, decode, header, read_file
 from sim.bench import ShelfOperator, SimBenchKind, SimOptions, Stage
-from sim.objects.photographs import PhotographsOnTable, photograph
-from sim.objects.projection import Image
+from sim.objects.projection import Floats, Image
 from sim.world import SimObject, World
 
 NAME = "photographs"
 _SECTION = f"bench.{NAME}"
-_SIDE_PX = (80, 8000)  # of `rig.config.device_sections.CameraConfig`
 _VIEWS = (4, 720)  # of `rig.config.schema.EnrollConfig`
 _SHOWN = 3
+_KEPT = 16  # decoded photographs: a move goes from one to the next, and large ones take 30 MB each
+
+
+@dataclass(frozen=True)
+class PhotographsOnTable:
+    """An object.
+
+    ``azimuth_deg``, float64 (n,), are the azimuths of the camera in its photographs, ascending, in [0, 360), and
+    ``files`` the photographs in that order.
+    """
+
+    name: str
+    azimuth_deg: Floats = field(repr=False)
+    files: tuple[Path, ...] = field(repr=False)
+    symmetry_deg: float = 360.0
+
+    @classmethod
+    def of(cls, name: str, views: Sequence[tuple[float, Path]]) -> Self:
+        """Return the object with these photographs: azimuth and file, by ascending azimuth."""
+        return cls(name, np.array([azimuth_deg for azimuth_deg, _ in views]), tuple(path for _, path in views))
+
+    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
+        """Fill ``image`` with the nearest photograph; ``offset_mm`` cannot move an object in a photograph.
+
+        The object's counter-clockwise rotation ``azimuth_deg`` moves the camera clockwise around it.
+        """
+        del offset_mm
+        image[:] = photograph(self.files[self.nearest(-azimuth_deg)])
+
+    def nearest(self, azimuth_deg: float) -> int:
+        """Return the index of the photograph nearest to an azimuth around the circle; of two, the first."""
+        apart = np.abs((self.azimuth_deg - azimuth_deg + 180) % 360 - 180)
+        return int(apart.argmin())
+
+
+@lru_cache(maxsize=_KEPT)
+def photograph(path: Path) -> Image:
+    """Return a photograph, uint8 (height, width, 3), BGR.
+
+    Raises `UsageError`: the file cannot be read, or is no image.
+    """
+    try:
+        image = decode(read_file(path))
+    except (OSError, BadImage) as error:
+        raise UsageError(
+            f"The photograph {path} cannot be used: {error}.", next_step="Replace or remove the file."
+        ) from error
+    image.flags.writeable = False
+    return image
 
 
 class PhotographOptions(SimOptions):
@@ -67,9 +114,9 @@ class PhotographedObjects:
     empty_table: PhotographsOnTable | None
     """The empty table; None if there is no image of it."""
     first: Path
-    """A photograph, whose size and colours the others must have."""
-    header: Header
-    """Of this photograph."""
+    """A photograph, whose size the others must have."""
+    size: tuple[int, int]
+    """Its width and height."""
     region: tuple[int, int, int, int] | None
     """The part of the frames that is described, if a table gives one for all its photographs; None: the whole frame."""
     findings: tuple[str, ...]
@@ -114,24 +161,18 @@ class PhotographedObjects:
             others = one if options.every == 1 else [view for n, view in enumerate(one) if n % options.every]
             identified[name] = PhotographsOnTable.of(name, others)
         first = next(iter(enrolled.values())).files[0]
-        shown = _header(first)
-        if not all(_SIDE_PX[0] <= side <= _SIDE_PX[1] for side in shown[:2]):
-            raise ConfigError(
-                f"{first} has {shown.width} x {shown.height} pixels; a camera has from {_SIDE_PX[0]} to {_SIDE_PX[1]} "
-                "along each side.",
-                next_step="Scale the photographs.",
-            )
         table = None if options.empty_table is None else _empty_table(found, options)
         region = regions.pop() if len(regions) == 1 else None
-        return cls(enrolled, identified, table, first, shown, region, _rejected(found))
+        return cls(enrolled, identified, table, first, _size(first), region, _rejected(found))
 
     def fitted(self, config: RigConfig) -> RigConfig:
         """Return a configuration with the camera of the photographs; region and number of views follow them, too.
 
-        Raises `ConfigError`: a region of the configuration is not within a photograph.
+        Raises `ConfigError`: no camera has the size of the photographs, or a region of the configuration is not within
+        them.
         """
         values = config.model_dump(exclude_unset=True)
-        width, height, _ = self.header
+        width, height = self.size
         values["camera"] = values.get("camera", {}) | {"width": width, "height": height}
         values["view"] = {"roi": self.region} | values.get("view", {})
         most = max(len(one.files) for one in self.enrolled.values())
@@ -164,15 +205,10 @@ class PhotographOperator(ShelfOperator):
         """Return the object called ``name``, with the photographs that are shown to enroll or to identify it.
 
         Raises `ObjectNotFound`: there are no photographs of that name. `UsageError`: there are too few, or they differ
-        in size or colours.
+        in size.
         """
+        super().thing(name, to_identify=to_identify)
         photographed = self._photographed
-        if name not in self.objects:
-            raise ObjectNotFound(
-                f"The bench of photographs has no object {name!r}.",
-                next_step="Choose a listed object.",
-                evidence={"objects": list(self.objects)},
-            )
         thing = (photographed.identified if to_identify else photographed.enrolled)[name]
         if len(thing.files) < 2:
             raise UsageError(
@@ -180,20 +216,12 @@ class PhotographOperator(ShelfOperator):
                 "it with; two are needed at least.",
                 next_step=f"Add photographs from other angles, or reduce {_SECTION}.every.",
             )
-        first = photographed.header
         for path in thing.files:
-            shown = _header(path)
-            if shown[:2] != first[:2]:
+            size, first = _size(path), photographed.size
+            if size != first:
                 raise UsageError(
-                    f"{path} has {shown.width} x {shown.height} pixels, but {photographed.first} has {first.width} x "
-                    f"{first.height}.",
+                    f"{path} has {size[0]} x {size[1]} pixels, but {photographed.first} has {first[0]} x {first[1]}.",
                     next_step="Crop or scale the photographs to one size: a bench has one camera.",
-                )
-            if shown.is_coloured != first.is_coloured:
-                grey, coloured = (photographed.first, path) if shown.is_coloured else (path, photographed.first)
-                raise UsageError(
-                    f"{grey} is grey, but {coloured} has colours.",
-                    next_step="Use photographs in colour, or only grey ones: a bench has one camera.",
                 )
         return thing
 
@@ -223,7 +251,8 @@ class PhotographsKind(SimBenchKind):
         return Stage(photographed.fitted(config), operator, photographed.findings)
 
 
-def _header(path: Path) -> Header:
+def _size(path: Path) -> tuple[int, int]:
+    """Return width and height of an image, without decoding it."""
     try:
         found = header(read_file(path))
     except OSError as error:
@@ -232,7 +261,7 @@ def _header(path: Path) -> Header:
         ) from error
     if found is None:
         raise UsageError(f"{path} is not a PNG or JPEG image.", next_step="Replace or remove the file.")
-    return found
+    return found.width, found.height
 
 
 def _empty_table(found: Photographs, options: PhotographOptions) -> PhotographsOnTable:

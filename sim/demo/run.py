@@ -40,10 +40,9 @@ from sim.change import Change
 from sim.faults import Fault
 from sim.faults.injector import Occurrence
 from sim.noise import NoiseModel
-from sim.objects.photographs import PhotographsOnTable
 from sim.objects.shelf import shelf
 from sim.objects.solid import Solid
-from sim.photographs import NAME, PhotographedObjects, PhotographOperator, PhotographOptions
+from sim.photographs import NAME, PhotographedObjects, PhotographOperator, PhotographOptions, PhotographsOnTable
 from sim.world import World
 
 ENROLLED = (

@@ -3,6 +3,5 @@
 from sim.servo.bus import Sender, SentBytes, ServoBus
 from sim.servo.device import SimServo
 from sim.servo.serial import SimSerial
-from sim.servo.shaft import Geared
 
-__all__ = ["Geared", "Sender", "SentBytes", "ServoBus", "SimSerial", "SimServo"]
+__all__ = ["Sender", "SentBytes", "ServoBus", "SimSerial", "SimServo"]

@@ -6,7 +6,7 @@ from math import cos, radians, sin
 from sim.servo.control_table import Memory
 from sim.servo.models import EXTENDED_POSITION_MODE, GAINS, POSITION_MODE, VELOCITY_MODE, ServoModel
 from sim.servo.motor import Motor
-from sim.servo.shaft import Shaft
+from sim.world import World
 
 # the e-manual calls these two thresholds of Moving Status predefined and states no values
 IN_POSITION_DEG, FOLLOWING_ERROR_DEG = 0.36, 8.8
@@ -34,7 +34,7 @@ class Controller:
     harmonic.
     """
 
-    def __init__(self, world: Shaft, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
+    def __init__(self, world: World, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
         self._world = world
         self._memory = memory
         self._motor = motor
@@ -222,7 +222,7 @@ class Controller:
         # of an X series servo; the encoder of a P series servo is before its gear
         noise_deg = self._world.noise.encoder_noise_deg * min(self._row.deg_per_count / (360 / 4096), 1.0)
         error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
-        return self._counts(self._world.rippled_deg() + error_deg)
+        return self._counts(self._motor.rippled_deg() + error_deg)
 
 
 _STANDSTILL = 1e-9  # smallest speed and acceleration of a profile: a profile of length 0 would have none

@@ -12,7 +12,7 @@ from sim.servo.controller import Controller
 from sim.servo.models import BAUD_RATES, POSITION_MODE, servo_model
 from sim.servo.motor import Motor
 from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, StatusError, StatusPacket, word
-from sim.servo.shaft import Shaft
+from sim.world import World
 
 BOOT_S = 0.2  # silence after power-up or Reboot; the e-manual states no value
 SUPERVISION_S = 0.1  # period of the checks of load and temperature while the servo works
@@ -28,7 +28,7 @@ _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"
 
 
 class SimServo:
-    """A servo whose horn is the table's shaft.
+    """A servo whose horn is the table's shaft, or the small wheel of a gear on it with this ``gear_ratio``.
 
     If one register of a block rejects its value, nothing of the block is written. The answer to a new id, baud rate or
     delay still uses the old one. A second servo on the same bus has another world on the same clock. ``firmware`` is
@@ -40,19 +40,20 @@ class SimServo:
 
     def __init__(
         self,
-        world: Shaft,
+        world: World,
         model: str = "xl430_w250",
         *,
         bus_id: int = 1,
         baudrate: int = 57_600,
         firmware: int | None = None,
         center_counts: int | None = None,
+        gear_ratio: float = 1.0,
     ) -> None:
         row = servo_model(model)
         if baudrate not in BAUD_RATES:
             raise ValueError(f"no servo has the baud rate {baudrate}: choose one of {', '.join(map(str, BAUD_RATES))}")
         self.model = row
-        self.motor = Motor(world, row)
+        self.motor = Motor(world, row, gear_ratio)
         self.distortions: list[Callable[[Memory], None]] = []
         """Called with the memory after its live registers are updated and before they are read, to falsify them."""
         self._clock = world.clock

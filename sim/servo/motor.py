@@ -1,11 +1,11 @@
-"""The gear motor on the world's shaft: trajectory, load, temperature and jams."""
+"""The gear motor on the table's shaft: trajectory, load, temperature and jams."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import copysign, exp
 
 from sim.motion import PiecewiseMotion, Response, rest, to_position, to_velocity
 from sim.servo.models import ServoModel
-from sim.servo.shaft import Shaft
+from sim.world import World
 
 FRICTION_LOAD = 0.04  # friction of the gears while the shaft rotates, as a part of the stall torque
 SUPPLY_DROP_V = 0.4  # voltage lost in the supply's cable at stall
@@ -38,17 +38,18 @@ class MotorState:
 
 
 class Motor:
-    """A position- or speed-controlled shaft in the world's degrees.
+    """A position- or speed-controlled shaft in its own degrees: ``gear_ratio`` revolutions for one of the table.
 
     The shaft follows the commanded trajectory by its `Response`, without noise exactly. If it is jammed it does not
     move, and the controller's error and the load grow. `settle` updates heat and overload with the present
     load; the owner of the motor calls it repeatedly while the motor is `busy`.
     """
 
-    def __init__(self, world: Shaft, model: ServoModel) -> None:
+    def __init__(self, world: World, model: ServoModel, gear_ratio: float = 1.0) -> None:
         self.supply_v = model.supply_v
-        self.commanded = rest(world.clock.now_ns() * 1e-9, world.shaft()[0])
         self._world = world
+        self._gear_ratio = gear_ratio
+        self.commanded = rest(self._now_s(), self.shaft()[0])
         self._model = model
         self.driven = False
         self._jammed = False
@@ -94,9 +95,18 @@ class Motor:
     def overloaded(self) -> bool:
         return self._overloaded_s >= OVERLOAD_S
 
+    def shaft(self) -> tuple[float, float]:
+        """Return angle (°) and speed (°/s) of the shaft, without ripple."""
+        angle, speed = self._world.shaft()
+        return angle * self._gear_ratio, speed * self._gear_ratio
+
+    def rippled_deg(self) -> float:
+        """Return the angle of the shaft with the ripple of its speed, as the encoder sees it."""
+        return self._world.rippled_deg() * self._gear_ratio
+
     def state(self) -> MotorState:
         now_s = self._now_s()
-        angle, speed = self._world.shaft()
+        angle, speed = self.shaft()
         target, target_dps, acceleration = self.commanded.state_at(now_s)
         load = pwm = 0.0
         if self.driven:
@@ -131,7 +141,7 @@ class Motor:
 
     def hold(self) -> None:
         """Hold the shaft at its angle."""
-        self._follow(rest(self._now_s(), self._world.shaft()[0]), driven=True)
+        self._follow(rest(self._now_s(), self.shaft()[0]), driven=True)
 
     def release(self) -> None:
         """Stop driving the shaft; friction stops it."""
@@ -159,7 +169,7 @@ class Motor:
         """Block the shaft at its angle."""
         self.settle()
         self._jammed = True
-        self._world.drive(rest(self._now_s(), self._world.shaft()[0]))
+        self._drive(rest(self._now_s(), self.shaft()[0]))
 
     def free(self) -> None:
         """Release a jammed shaft; it moves to its commanded angle at maximum speed."""
@@ -167,7 +177,7 @@ class Motor:
         self._jammed = False
         if not self.driven:
             return
-        angle, cruise = self._world.shaft()[0], float(self.commanded.velocity_dps[-1])
+        angle, cruise = self.shaft()[0], float(self.commanded.velocity_dps[-1])
         if cruise:
             self._follow(to_velocity(self._now_s(), angle, 0.0, cruise, self.steepest_dps2))
         else:
@@ -186,7 +196,7 @@ class Motor:
         if self.driven and not self._jammed and not self.commanded.velocity_dps[-1] and not self.profile_ongoing:
             goal = float(self.commanded.position_deg[-1])
             self._follow(
-                to_position(self._now_s(), *self._world.shaft(), goal, self.fastest_dps, self.steepest_dps2),
+                to_position(self._now_s(), *self.shaft(), goal, self.fastest_dps, self.steepest_dps2),
             )
 
     def push(self, angle_deg: float) -> float:
@@ -196,12 +206,12 @@ class Motor:
         """
         if self.driven or self._jammed:
             raise ValueError("A held shaft cannot be rotated: switch the servo's torque off and free it first.")
-        angle, speed = self._world.shaft()
+        angle, speed = self.shaft()
         self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, HAND_DPS, 4 * HAND_DPS))
         return self.commanded.end_s - self._now_s()
 
     def _stop(self) -> PiecewiseMotion:
-        return to_velocity(self._now_s(), *self._world.shaft(), 0.0, self.steepest_dps2)
+        return to_velocity(self._now_s(), *self.shaft(), 0.0, self.steepest_dps2)
 
     def _follow(self, path: PiecewiseMotion, driven: bool | None = None) -> None:
         self.settle()
@@ -213,9 +223,20 @@ class Motor:
         if self.driven and (self._lag_s or self._friction):
             offset_deg = -self._model.stall_error_deg * self._steady_load
             response = Response(self._lag_s, self._model.inertia_s, self.held_deg, offset_deg, self.fastest_dps)
-            path = response.follow(path, *self._world.shaft())
+            path = response.follow(path, *self.shaft())
         self._still_s = path.end_s
-        self._world.drive(path)
+        self._drive(path)
+
+    def _drive(self, path: PiecewiseMotion) -> None:
+        ratio = self._gear_ratio
+        self._world.drive(
+            replace(
+                path,
+                position_deg=path.position_deg / ratio,
+                velocity_dps=path.velocity_dps / ratio,
+                acceleration_dps2=path.acceleration_dps2 / ratio,
+            )
+        )
 
     def _now_s(self) -> float:
         return self._world.clock.now_ns() * 1e-9

@@ -23,7 +23,7 @@ from sim.noise import NoiseModel
     ],
 )
 def test_invalid_noise_values_are_rejected_by_name(name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"{name} = "):
+    with pytest.raises(ValueError, match=name):
         NoiseModel(**{name: value})
 
 
@@ -37,7 +37,7 @@ def test_model_without_noise_has_no_noise() -> None:
     ("setting", "words"),
     [
         ("servo.baud=12345", "57600"),
-        ("bench.sim.noise.structure_damping=1.5", "below 1"),
+        ("bench.sim.noise.structure_damping=1.5", "structure_damping: Input should be less than 1"),
     ],
 )
 def test_invalid_simulated_bench_is_a_configuration_error(setting: str, words: str) -> None:

@@ -17,8 +17,8 @@ from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.config import load_config
 from rig.core.clock import SystemClock
-from sim.objects.photographs import PhotographsOnTable
 from sim.objects.projection import Image
+from sim.photographs import PhotographsOnTable
 
 SIZE = 100
 GROUND = (120, 70, 30)
@@ -227,8 +227,7 @@ def damaged(folder: Path) -> None:
         (Path.mkdir, "No photograph in photographs", "bench.photographs.pattern"),
         (lambda folder: save(folder, step_deg=360), "obj1 has 1 photograph to enroll it with", "Add photographs"),
         (replaced(np.zeros((90, SIZE, 3), np.uint8)), "obj1__90.png has 100 x 90 pixels", "one size"),
-        (replaced(np.zeros((SIZE, SIZE), np.uint8)), "obj1__90.png is grey", "in colour"),
-        (small, "60 x 60 pixels", "Scale the photographs"),
+        (small, "60 x 60 pixels", "Fix the listed keys"),
         (damaged, "obj1__90.png cannot be used: truncated", "Replace or remove"),
     ],
 )
