@@ -111,9 +111,6 @@ class IdentifyConfig(Section):
     )
     omega: float = Field(0.5, ge=0, le=100, description="weight of the orientation term")
     list_length: int = Field(10, ge=1, le=1000, description="views on a retrieval list")
-    index: Literal["flat", "tree"] = Field(
-        "flat", description="search for similar views: flat: compares all, tree: the paper's KD-tree; same answers"
-    )
     extension: Literal["visual", "orient", "orient_all"] = Field(
         "orient_all", description="how missing views are filled in"
     )

@@ -11,7 +11,7 @@ Decisions: docs/decisions/0002, docs/decisions/0019.
 from collections.abc import Collection, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 from typing import Final
@@ -70,18 +70,21 @@ class EnrollmentViews:
 
     bench: Bench
     enrollment: OpenEnrollment | Retake
-    segment: ViewSegmenter
-    table: Turntable
-    viewer: Viewer
+    empty_table: NDArray[np.uint8] | None
+    """The sheet of empty-table images (`rig.views.table_sheet`)."""
+    in_motion: bool = False
     first: _SeenView | None = None
     """The image that shows, taken again at the end, whether the object was moved: by default the first one."""
-    retakes: int = 0
+    retakes: int = field(default=0, init=False)
     """The number of images that were taken again."""
 
     def __post_init__(self) -> None:
-        self._check = ObjectCheck(self.bench, self.segment.empty_table)
+        self.segment = ViewSegmenter(self.bench.config.view, empty_table=self.empty_table)
+        self.viewer = Viewer(self.bench.camera, self.bench.config, encodes=not self.in_motion)
+        self.table = Turntable(self.bench)
+        self._check = ObjectCheck(self.bench, self.empty_table)
 
-    def take(self, angles_deg: Mapping[int, float], *, in_motion: bool) -> Generator[Event, None, None]:
+    def take(self, angles_deg: Mapping[int, float]) -> Generator[Event, None, None]:
         """Take and store the views at these table angles; check that the object was not moved; return to 0.
 
         Raises `LimitExceeded`: the cable budget does not allow a revolution. `NoObject`: the table is empty.
@@ -89,15 +92,20 @@ class EnrollmentViews:
         revolution. `ObjectMoved`: the object was moved between any two views, so all views of this session are
         abandoned.
         """
-        left = dict(angles_deg)
-        if in_motion:
-            stored = yield from self._fly(angles_deg)
-            left = {index: angle_deg for index, angle_deg in angles_deg.items() if index not in stored}
-            self.retakes += len(left)
-        if not left:
-            self._park()
-            return
-        last = yield from self._step(left)
+        with self.table:
+            left = dict(angles_deg)
+            if self.in_motion:
+                stored = yield from self._fly(angles_deg)
+                left = {index: angle_deg for index, angle_deg in angles_deg.items() if index not in stored}
+                self.retakes += len(left)
+            if left:
+                yield from self._at_rest(left)
+            else:
+                self._park()
+
+    def _at_rest(self, angles_deg: Mapping[int, float]) -> Generator[Event, None, None]:
+        """Take and store the views at these table angles at rest, check the first view again, and return to 0."""
+        last = yield from self._step(angles_deg)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
         # supply the servo loses the count of revolutions, and the next enrollment would wind up the cable further.
         first = self.first or last
@@ -369,7 +377,9 @@ def enroll(
     if missing:
         try:
             bench.place(enrollment.object_name)
-            retakes = yield from _take(bench, enrollment, to_go, empty_table, in_motion=in_motion)
+            taking = EnrollmentViews(bench, enrollment, empty_table, in_motion)
+            yield from taking.take(to_go)
+            retakes = taking.retakes
         except BaseException:
             if not resume:
                 with suppress(RigError):  # it has views to resume
@@ -407,7 +417,7 @@ def retake(bench: Bench, catalog: Catalog, name: str, indices: Collection[int]) 
     )
     bench.place(taking.object_name)
     try:
-        yield from _take(bench, taking, to_go, empty_table, seen)
+        yield from EnrollmentViews(bench, taking, empty_table, first=seen).take(to_go)
     except ObjectMoved as error:
         raise ObjectMoved(
             f"{taking.object_name} does not stand as it stood for view {known.index + 1}, or that view is bad, too. "
@@ -433,24 +443,6 @@ def _session(bench: Bench) -> tuple[Provenance, NDArray[np.uint8] | None]:
     }
     provenance = Provenance(bench=bench.name, devices=bench.devices(), conditions=conditions)
     return provenance, None if status.table is None else status.table.image_bgr
-
-
-def _take(
-    bench: Bench,
-    enrollment: OpenEnrollment | Retake,
-    angles_deg: Mapping[int, float],
-    empty_table: NDArray[np.uint8] | None,
-    first: _SeenView | None = None,
-    *,
-    in_motion: bool = False,
-) -> Generator[Event, None, int]:
-    """Take and store views, as `EnrollmentViews.take`; return how many images were taken again."""
-    segment = ViewSegmenter(bench.config.view, empty_table=empty_table)
-    viewer = Viewer(bench.camera, bench.config, encodes=not in_motion)
-    with Turntable(bench) as table:
-        taking = EnrollmentViews(bench, enrollment, segment, table, viewer, first)
-        yield from taking.take(angles_deg, in_motion=in_motion)
-    return taking.retakes
 
 
 def similar_objects(views: Views, name: str) -> SimilarObjects:

@@ -1,13 +1,12 @@
 """The table angles of an enrollment, and the time that is left of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, floor
 from typing import Final
 
 from hbr.core.angles import wrap360
-from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Event
@@ -67,7 +66,7 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
 
 @dataclass(eq=False)
 class TimeLeft:
-    """Remaining time of an enrollment: the motion model, scaled by the time that the views so far really took.
+    """Remaining time of an enrollment by the motion model.
 
     ``model`` gives the durations of moves and views, ``angles_deg`` are the table angles of the coming views. Views
     ``in_motion`` are taken in one revolution, and reported after it.
@@ -76,24 +75,18 @@ class TimeLeft:
     model: MotionTimes
     angles_deg: Sequence[float]
     in_motion: bool = False
-    _exposed_ns: list[int] = field(default_factory=list, init=False)
+    done: int = 0
 
     def add(self, event: Event) -> None:
         """Take the next event of the plan."""
-        if isinstance(event, Accepted):
-            self._exposed_ns.append(event.evidence.exposed_ns)
+        self.done += isinstance(event, Accepted)
 
     @property
     def seconds(self) -> float:
         """Remaining time in the bench's clock, until the table is back at 0."""
-        model, done, angles = self.model, len(self._exposed_ns), self.angles_deg
-        if not angles:
-            return 0.0
-        if not done:
-            return model.enrollment_s(angles[0], angles, in_motion=self.in_motion)
+        model, angles_deg = self.model, self.angles_deg
+        if not self.done or not angles_deg:
+            return model.enrollment_s(angles_deg[0] if angles_deg else 0.0, angles_deg, in_motion=self.in_motion)
         if self.in_motion:
-            return model.park_s(angles[0] + 360.0)
-        left, expected = model.views_s(angles[done - 1 :]), model.views_s(angles[:done])
-        if expected > 0:
-            left *= seconds_between(self._exposed_ns[0], self._exposed_ns[-1]) / expected
-        return left + model.move_s(-angles[-1])
+            return model.park_s(angles_deg[0] + 360.0)
+        return model.views_s(angles_deg[self.done - 1 :]) + model.move_s(-angles_deg[-1])

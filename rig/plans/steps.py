@@ -127,7 +127,7 @@ def _no_object(reason: str, evidence: Mapping[str, float] | None = None) -> NoOb
 def warn_of_table(bench: Bench, index: int, view: DescribedView) -> Generator[Event, None, None]:
     """Store and report that the bench no longer looks like its empty-table image, if this view has shown it."""
     if view.table_problem is not None:
-        store_table_problem(bench, view.table_problem)
+        store_table_problem(bench, view.table_problem.parameters["agreement"])
         yield Warned(index, Note(NoteCode.EMPTY_TABLE_CHANGED, {"problem": view.table_problem.as_json()}))
 
 

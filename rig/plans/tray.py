@@ -2,11 +2,10 @@
 
 import csv
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
@@ -51,35 +50,24 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
 
     Raises `UsageError`: the file cannot be read, or it has mistakes; the evidence lists all of them with their lines.
     """
-    step = "Choose a CSV file."
-    with os_errors_as(UsageError, f"The list {path} cannot be read.", next_step=step):
+    with os_errors_as(UsageError, f"The list {path} cannot be read.", next_step="Choose a CSV file."):
         content = read(path, max_bytes=MAX_FILE_BYTES)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise UsageError(
-            f"The list {path} is not encoded in UTF-8.",
-            next_step='Save it as "CSV UTF-8".',
-            evidence={"mistakes": [f"line {line}: byte 0x{error.object[error.start]:02x}"]},
-        ) from error
     # All mistakes are reported at once, so that the list is corrected once.
-    mistakes: list[str] = []
     items: list[TrayItem] = []
+    mistakes: list[str] = []
     try:
-        rows = _rows(text)
-        first, headings = next(rows, (1, []))
-        headings = [heading.strip().lower() for heading in headings]
-        mistakes += _heading_mistakes(first, headings)
-        if not mistakes:
-            for line, cells in rows:
-                if any(cell.strip() for cell in cells):
-                    try:
-                        items.append(_item(line, headings, cells))
-                    except UsageError as error:
-                        mistakes.append(f"line {line}: {error.what.rstrip('.')}")
+        for line, row in _rows(content.decode("utf-8-sig")):
+            try:
+                items.append(_item(line, row))
+            except UsageError as error:
+                mistakes.append(f"line {line}: {error.what.rstrip('.')}")
+    except UnicodeDecodeError as error:
+        line, byte = error.object[: error.start].count(b"\n") + 1, error.object[error.start]
+        mistakes.append(f'line {line}: byte 0x{byte:02x} is not UTF-8; save the list as "CSV UTF-8"')
     except csv.Error as error:
         mistakes.append(f"this is not CSV: {error}")
+    except UsageError as error:
+        mistakes.append(error.what.rstrip("."))
     counts = Counter(item.name for item in items)
     mistakes += [
         f"line {item.line}: {item.name!r} is in the list {counts[item.name]} times"
@@ -95,6 +83,41 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
             evidence={"mistakes": mistakes},
         )
     return tuple(items)
+
+
+def _rows(text: str) -> Iterator[tuple[int, Mapping[str | None, Any]]]:
+    """Yield the rows that are not empty by their headings, each with its last line in the file, from 1.
+
+    Raises `UsageError`: the headings are not those of a tray.
+    """
+    header = text.partition("\n")[0]
+    separator = ";" if header.count(";") > header.count(",") else ","
+    reader = csv.DictReader(text.splitlines(keepends=True), delimiter=separator, strict=True)
+    headings = reader.fieldnames = [heading.strip().lower() for heading in reader.fieldnames or ()]
+    if "name" not in headings or len({*headings, *COLUMNS}) > len(COLUMNS) or len(set(headings)) < len(headings):
+        raise UsageError(
+            f"line 1: its columns are {', '.join(headings) or 'missing'}, but they must be name, and each at most once "
+            f"{', '.join(COLUMNS[1:])}.",
+            next_step="Correct it.",
+        )
+    for row in reader:
+        if any(row.values()):
+            yield reader.line_num, row
+
+
+def _item(line: int, row: Mapping[str | None, Any]) -> TrayItem:
+    if None in row:  # the cells beyond the headings
+        raise UsageError("It has more values than columns.", next_step="Put text with a comma in quotes.")
+    values = {heading: cell.strip() for heading, cell in row.items() if cell is not None}
+    views = None
+    if values.get("views"):
+        views = whole(values["views"])
+        if views is None or not MIN_VIEWS <= views <= MAX_VIEWS:
+            raise UsageError(
+                f"views is {values['views'][:20]!r}, not a number from {MIN_VIEWS} to {MAX_VIEWS}.",
+                next_step="Correct it.",
+            )
+    return TrayItem(line, clean_name(values.get("name", "")), values.get("label"), values.get("note"), views)
 
 
 def left_to_enroll(catalog: Catalog, items: Sequence[TrayItem]) -> list[TrayItem]:
@@ -192,44 +215,3 @@ def after_error(error: RigError, item: TrayItem) -> Question:
     choices = {Choice.CONTINUE: "try again", Choice.SKIP: "skip", Choice.STOP: "stop"}
     text = f"{item.name}: {error.what}"
     return Question(Subject.FAILURE, text, choices, unattended=Choice.STOP, steps=error.steps)
-
-
-def _rows(text: str) -> Generator[tuple[int, list[str]], None, None]:
-    """Yield each row with its first line in the file, from 1."""
-    header = text.partition("\n")[0]
-    separator = ";" if header.count(";") > header.count(",") else ","
-    reader = csv.reader(text.splitlines(keepends=True), delimiter=separator, strict=True)
-    line = 1
-    for cells in reader:
-        yield line, cells
-        line = reader.line_num + 1
-
-
-def _heading_mistakes(line: int, headings: Sequence[str]) -> list[str]:
-    mistakes = []
-    for heading in headings:
-        if heading not in COLUMNS:
-            near = get_close_matches(heading, COLUMNS, n=1)
-            hint = f"Did you mean {near[0]}?" if near else f"The columns are {', '.join(COLUMNS)}."
-            mistakes.append(f"line {line}: {heading!r} is not a column. {hint}")
-    mistakes += [f"line {line}: the column {h} is there twice" for h, n in Counter(headings).items() if n > 1]
-    if "name" not in headings and not mistakes:
-        mistakes.append(f"line {line}: there is no column name; the first line must be {','.join(COLUMNS)}")
-    return mistakes
-
-
-def _item(line: int, headings: Sequence[str], cells: Sequence[str]) -> TrayItem:
-    if len(cells) > len(headings):
-        raise UsageError(
-            f"{len(cells)} values in {len(headings)} columns.", next_step="Put text with a comma in quotes."
-        )
-    values = {heading: cell.strip() for heading, cell in zip(headings, cells, strict=False)}
-    views = None
-    if values.get("views"):
-        views = whole(values["views"])
-        if views is None or not MIN_VIEWS <= views <= MAX_VIEWS:
-            raise UsageError(
-                f"views is {values['views'][:20]!r}, not a number from {MIN_VIEWS} to {MAX_VIEWS}.",
-                next_step="Correct it.",
-            )
-    return TrayItem(line, clean_name(values.get("name", "")), values.get("label"), values.get("note"), views)

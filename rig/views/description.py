@@ -20,7 +20,7 @@ from hbr.segmentation.background import SegmentedFrame
 from hbr.segmentation.segment import evidence_together, stored_segmentation
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
-from rig.views.table_problems import TableProblem, TableProblemCode
+from rig.views.table_problems import IN_A_ROW, TableProblem, surroundings_problem
 from rig.views.table_sheet import TableSheet, table_image
 
 Value = TypeVar("Value", bound=np.generic)
@@ -33,23 +33,6 @@ DENSE_DESCRIPTORS: Final = (LIGHT, FULL)
 """The descriptors of the dense search: a run may come from a computer without the network."""
 DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
-IN_A_ROW: Final = 3
-"""Number of successive frames that must differ from the empty-table image: one or two can show the operator's arm."""
-
-_TEXT: Final = {
-    IssueCode.TABLE_SIZE: "the empty-table image has another size than the frames",
-    IssueCode.TABLE_AZIMUTH: "the camera moves, and no empty-table image was taken near the azimuth",
-    IssueCode.TABLE_DIFFERS: "the surroundings do not look like the empty-table image",
-    IssueCode.BACKDROP_EXPOSURE: "the backdrop is too dark or overexposed to measure its colour",
-    IssueCode.BACKDROP_COLOURS: "the backdrop has several colours, so none can be taken for grey",
-    IssueCode.BACKDROP_COLOURFUL: "the backdrop is not grey",
-    IssueCode.BACKDROP_LEVEL: "the backdrop is too dark or too bright to correct the exposure",
-    IssueCode.BACKGROUND_NOT_PLAIN: "the background is not plain",
-    IssueCode.DOUBTFUL_OUTLINE: "the platter or the backdrop may be inside the box",
-    IssueCode.NO_GUESS: "no part of the frame stands out",
-    IssueCode.NO_OBJECT: "no object was found while the table rotated",
-    IssueCode.NO_DIFFERENCE: "nothing differs from the background",
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,8 +115,7 @@ class ViewSegmenter:
         if len(self._low) < IN_A_ROW:
             return None
         self._reported = True
-        parameters = {"frames": IN_A_ROW, "agreement": round(max(self._low), 3)}
-        return TableProblem(TableProblemCode.SURROUNDINGS, parameters)
+        return surroundings_problem(max(self._low))
 
     def rotation_deg(self, azimuth_deg: float, rotation_deg: float) -> float:
         """Return the rotation from the azimuth of the last view that ends where an empty-table image was taken."""
@@ -249,49 +231,36 @@ class SearchDescriber(ViewSegmenter):
         )
 
 
-@dataclass(frozen=True, slots=True)
-class SegmentationSummary:
-    """Summary of the segmentation of several views: numbers of views."""
+def segmentation_summary(evidence: Iterable[Mapping[str, Any] | None]) -> dict[str, Any]:
+    """Return numbers of views, from the stored evidence of several; None is a view without segmentation.
 
-    views: int
-    """Views with segmentation evidence."""
-    found: int
-    """Views in which the object was found reliably, and not only guessed."""
-    guessed: int
-    corrected: int
-    """Views whose illumination was corrected."""
-    issues: Mapping[str, int]
-    """Views with each `hbr.segmentation.IssueCode`, the most frequent first."""
+    ``views`` have evidence; in ``found`` of them the object was found reliably, in ``guessed`` it was only guessed. In
+    ``corrected`` the illumination was corrected. ``issues`` counts the views with each `hbr.segmentation.IssueCode`,
+    the most frequent first.
+    """
+    views = [one for one in evidence if one is not None]
+    boxes = [one for one in views if one.get("box_px") is not None]
+    guessed = sum(one.get("method") == BoxMethod.GUESS for one in boxes)
+    codes = Counter(code for one in views for code in {issue["code"]: None for issue in one.get("issues", ())})
+    return {
+        "views": len(views),
+        "found": len(boxes) - guessed,
+        "guessed": guessed,
+        "corrected": sum(one.get("gains_bgr") is not None for one in views),
+        "issues": dict(codes.most_common()),
+    }
 
-    @classmethod
-    def of(cls, evidence: Iterable[Mapping[str, Any] | None]) -> "SegmentationSummary":
-        """Summarise the stored evidence of views; None is a view without segmentation."""
-        views = [one for one in evidence if one is not None]
-        boxes = [one for one in views if one.get("box_px") is not None]
-        guessed = sum(one.get("method") == BoxMethod.GUESS for one in boxes)
-        codes = Counter(code for one in views for code in {issue["code"]: None for issue in one.get("issues", ())})
-        return cls(
-            views=len(views),
-            found=len(boxes) - guessed,
-            guessed=guessed,
-            corrected=sum(one.get("gains_bgr") is not None for one in views),
-            issues=dict(codes.most_common()),
-        )
 
-    @property
-    def text(self) -> str:
-        """The summary in one line; empty if no view has segmentation evidence."""
-        if not self.views:
-            return ""
-        guessed = f", guessed in {self.guessed}" if self.guessed else ""
-        known = set(IssueCode)
-        issues = "".join(
-            f"; {_TEXT[IssueCode(code)] if code in known else code} ({count})" for code, count in self.issues.items()
-        )
-        return (
-            f"object found in {self.found} of {self.views} views{guessed}, illumination corrected in {self.corrected}"
-            f"{issues}"
-        )
+def segmentation_words(summary: Mapping[str, Any]) -> str:
+    """Return a `segmentation_summary` in one line; empty if no view has segmentation evidence."""
+    if not summary["views"]:
+        return ""
+    guessed = f", guessed in {summary['guessed']}" if summary["guessed"] else ""
+    issues = "".join(f"; {code.replace('-', ' ')} ({count})" for code, count in summary["issues"].items())
+    return (
+        f"object found in {summary['found']} of {summary['views']} views{guessed}, illumination corrected in "
+        f"{summary['corrected']}{issues}"
+    )
 
 
 def check_evidence(evidence: object) -> None:

@@ -7,64 +7,43 @@ Decision: docs/decisions/0012.
 
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    AwareDatetime,
-    BaseModel,
-    ConfigDict,
-    Field,
-    PlainSerializer,
-    PlainValidator,
-    SkipValidation,
-    ValidationError,
-)
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, SkipValidation, ValidationError
 
 from rig.bench import Bench
 from rig.core.errors import StateNotStored
 from rig.devices.camera import CameraIdentity, CameraLocks
 from rig.views import image_files as images
-from rig.views.table_problems import TableProblem, TableProblemCode
+from rig.views.table_problems import TableProblem, TableProblemCode, surroundings_problem
 from rig.views.table_sheet import TableSheet
 
 MAX_AGE_H: Final = 12.0
 """A working day. On another day the illumination is different."""
 
 _FILE: Final = "empty-table.json"
-_VERSION: Final = 1
-
-
-def _problem(values: object) -> TableProblem | None:
-    if values is None or isinstance(values, TableProblem):
-        return values
-    if not isinstance(values, dict):
-        raise ValueError("a problem of an empty-table image that is not an object")
-    return TableProblem(
-        TableProblemCode(str(values.get("code"))), {name: values[name] for name in values.keys() - {"code"}}
-    )
 
 
 class EmptyTable(BaseModel):
     """A sheet of empty-table images, and how it was taken; without its pixels, the content of the JSON file beside it.
 
     ``image_bgr`` is the sheet, uint8 (H, W, 3). Its images are whole frames. The one at the table angle 0 was accepted
-    with the measurements ``evidence``. A search or an enrollment may have ``noticed`` a problem since then. The name of
-    the file ``image`` contains the SHA-256 of its bytes.
+    with the measurements ``evidence``. A search or an enrollment may have ``noticed`` since then that the surroundings
+    differ; it is the largest agreement of frames in a row, from 0 to 1. The name of the file ``image`` contains the
+    SHA-256 of its bytes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
-    version: int = _VERSION
+    version: Literal[1] = 1
     image_bgr: SkipValidation[NDArray[np.uint8]] = Field(np.empty((0, 0, 3), np.uint8), exclude=True, repr=False)
     taken_utc: AwareDatetime
     camera: CameraIdentity
     locks: CameraLocks
     evidence: dict[str, Any]
-    noticed: Annotated[
-        TableProblem | None, PlainValidator(_problem), PlainSerializer(lambda one: one and one.as_json())
-    ] = None
+    noticed: float | None = None
     image: str = Field("", pattern=r"^empty-table-[0-9a-f]{64}\.png$")
 
 
@@ -92,14 +71,30 @@ class EmptyTableStatus:
 def empty_table_status(bench: Bench) -> EmptyTableStatus:
     """Return the bench's empty-table image and its problems."""
     try:
-        table = _read(bench)
-    except _Unreadable as error:
-        return EmptyTableStatus(None, (TableProblem(TableProblemCode.UNREADABLE, {"detail": str(error)}),))
+        table = _stored(bench)
+        png = None if table is None else bench.state.read_file(table.image)
+        image_bgr = None if png is None else images.decode(png)
+    except StateNotStored as error:
+        return _unreadable(error.what.rstrip("."))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        return _unreadable(f"{_FILE} is damaged ({'.'.join(map(str, first['loc']))}: {first['msg']})")
+    except images.BadImage as error:
+        return _unreadable(f"its file is damaged: {error}")
     if table is None:
         return EmptyTableStatus(None, (TableProblem(TableProblemCode.MISSING),))
+    if png is None or image_bgr is None:
+        return _unreadable(f"{table.image} is missing")
+    if images.digest(png) not in table.image:
+        return _unreadable(f"{table.image} is damaged")
+    table = table.model_copy(update={"image_bgr": image_bgr})
     if unusable := _unusable(table, bench):
         return EmptyTableStatus(None, (unusable,))
     return EmptyTableStatus(table, _reasons_for_new_image(table, bench))
+
+
+def _unreadable(detail: str) -> EmptyTableStatus:
+    return EmptyTableStatus(None, (TableProblem(TableProblemCode.UNREADABLE, {"detail": detail}),))
 
 
 def store_empty_table(bench: Bench, table: EmptyTable) -> None:
@@ -109,19 +104,19 @@ def store_empty_table(bench: Bench, table: EmptyTable) -> None:
     """
     png = images.encode(table.image_bgr)
     stored = table.model_copy(update={"image": f"empty-table-{images.digest(png)}.png"})
-    before = _described(bench, quiet=True)
+    before = _stored_if_readable(bench)
     bench.state.store_file(stored.image, png)
     _store(bench, stored)
     if before is not None and before.image != stored.image:
         bench.state.remove_file(before.image)
 
 
-def store_table_problem(bench: Bench, problem: TableProblem) -> None:
-    """Store a problem with the bench's image, so that the next command asks for a new image."""
-    before = _described(bench, quiet=True)
+def store_table_problem(bench: Bench, agreement: float) -> None:
+    """Store with the bench's image that the surroundings differ, so that the next command asks for a new image."""
+    before = _stored_if_readable(bench)
     if before is not None:
         with suppress(StateNotStored):  # the warning was shown; other writes report a full disk
-            _store(bench, before.model_copy(update={"noticed": problem}))
+            _store(bench, before.model_copy(update={"noticed": agreement}))
 
 
 def _store(bench: Bench, table: EmptyTable) -> None:
@@ -152,44 +147,21 @@ def _reasons_for_new_image(table: EmptyTable, bench: Bench) -> tuple[TableProble
         for name, before in asdict(table.locks).items()
         if before is not None and now[name] is not None and before != now[name]
     ]
-    return (*problems, *([table.noticed] if table.noticed else []))
+    if table.noticed is not None:
+        problems.append(surroundings_problem(table.noticed))
+    return tuple(problems)
 
 
-class _Unreadable(Exception):
-    pass
+def _stored(bench: Bench) -> EmptyTable | None:
+    """Return the stored image without its pixels; None if there is none.
+
+    Raises `StateNotStored`, `ValidationError`: its file cannot be read, or is damaged.
+    """
+    text = bench.state.read_file(_FILE)
+    return None if text is None else EmptyTable.model_validate_json(text)
 
 
-def _described(bench: Bench, *, quiet: bool = False) -> EmptyTable | None:
-    """Return the stored image without its pixels; None if there is none, or if ``quiet`` and it is not readable."""
-    try:
-        text = bench.state.read_file(_FILE)
-        found = None if text is None else EmptyTable.model_validate_json(text)
-    except StateNotStored as error:
-        detail = error.what.rstrip(".")
-    except ValidationError as error:
-        detail = f"{_FILE} is damaged ({error.errors(include_url=False)[0]['msg']})"
-    else:
-        if found is None or found.version == _VERSION:
-            return found
-        detail = f"{_FILE} has version {found.version}, this program reads version {_VERSION}"
-    if quiet:
-        return None
-    raise _Unreadable(detail)
-
-
-def _read(bench: Bench) -> EmptyTable | None:
-    table = _described(bench)
-    if table is None:
-        return None
-    try:
-        png = bench.state.read_file(table.image)
-    except StateNotStored as error:
-        raise _Unreadable(error.what.rstrip(".")) from error
-    if png is None:
-        raise _Unreadable(f"{table.image} is missing")
-    if images.digest(png) not in table.image:
-        raise _Unreadable(f"{table.image} is damaged")
-    try:
-        return table.model_copy(update={"image_bgr": images.decode(png)})
-    except images.BadImage as error:
-        raise _Unreadable(f"{table.image} is not readable: {error}") from error
+def _stored_if_readable(bench: Bench) -> EmptyTable | None:
+    with suppress(StateNotStored, ValidationError):
+        return _stored(bench)
+    return None

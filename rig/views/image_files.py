@@ -41,20 +41,17 @@ PNG_SETTINGS: Final = [
 def encode(image_bgr: NDArray[np.uint8]) -> bytes:
     """Encode an image, uint8 (H, W, 3) BGR, as PNG, without loss.
 
-    Raises `UsageError`: the array has another type or shape, or is empty.
+    Raises `UsageError`: the array has another type or shape, is empty, or is too large.
     """
-    if image_bgr.dtype != np.uint8 or image_bgr.ndim != 3 or image_bgr.shape[2] != 3 or not image_bgr.size:
+    shape = image_bgr.shape
+    is_image = image_bgr.dtype == np.uint8 and image_bgr.ndim == 3 and shape[2] == 3 and image_bgr.size > 0
+    if not is_image or max(shape) > MAX_SIDE or shape[0] * shape[1] > MAX_PIXELS:
         raise UsageError(
-            f"An image of {image_bgr.dtype} with shape {image_bgr.shape} cannot be stored.",
-            next_step="Store BGR images as uint8 with shape (H, W, 3).",
+            f"An image of {image_bgr.dtype} with shape {shape} cannot be stored.",
+            next_step=f"Store BGR images as uint8 with shape (H, W, 3), of at most {MAX_PIXELS} pixels.",
         )
-    if max(image_bgr.shape) > MAX_SIDE or image_bgr.shape[0] * image_bgr.shape[1] > MAX_PIXELS:
-        raise UsageError(f"An image of shape {image_bgr.shape} cannot be stored.", next_step="Store a smaller image.")
     encoded, png = cv2.imencode(".png", np.ascontiguousarray(image_bgr), PNG_SETTINGS)
-    if not encoded:
-        raise UsageError(
-            f"An image of shape {image_bgr.shape} cannot be encoded as PNG.", next_step="Store a smaller image."
-        )
+    assert encoded  # an array of this type and size always is
     return png.tobytes()
 
 

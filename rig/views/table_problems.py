@@ -1,7 +1,7 @@
 """Problems of an empty-table image: codes with parameters, and their texts."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from hbr.segmentation.background import Issue
 from rig.core.phrases import Worded, filled
@@ -36,6 +36,15 @@ class TableProblem(Issue):
     def text(self) -> str:
         """The problem in words."""
         return problem_text(self.as_json())
+
+
+IN_A_ROW: Final = 3
+"""Number of successive frames that must differ from the empty-table image: one or two can show the operator's arm."""
+
+
+def surroundings_problem(agreement: float) -> TableProblem:
+    """Return the problem that `IN_A_ROW` frames agree with the image over at most this share of their border."""
+    return TableProblem(TableProblemCode.SURROUNDINGS, {"frames": IN_A_ROW, "agreement": round(agreement, 3)})
 
 
 def problem_text(problem: Mapping[str, Any]) -> str:

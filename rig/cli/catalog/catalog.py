@@ -22,7 +22,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, UsageError
 from rig.core.json_form import plain
 from rig.core.phrases import angle_words, counted
-from rig.views.description import SegmentationSummary
+from rig.views.description import segmentation_summary, segmentation_words
 
 # Decision: docs/decisions/0010.
 app = Group(__doc__)
@@ -117,7 +117,7 @@ def _as_json(details: ObjectDetails, described: Described) -> dict[str, Any]:
         }
         for place, view in enumerate(details.views)
     ]
-    segmentation = SegmentationSummary.of(described.segmentation)
+    segmentation = segmentation_summary(described.segmentation)
     shown = {"summary": details.summary, "enrollments": enrollments, "views": views, "segmentation": segmentation}
     return dict(plain(shown))
 
@@ -138,7 +138,7 @@ def _print_object(details: ObjectDetails, described: Described) -> None:
             by = session.provenance
             print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: bench {by.bench or '–'}, software {by.software}")
     if details.views:
-        if words := SegmentationSummary.of(described.segmentation).text:
+        if words := segmentation_words(segmentation_summary(described.segmentation)):
             print(words)
         rows = [
             (

@@ -28,7 +28,7 @@ from rig.views.description import (
     DESCRIPTORS,
     PAPER_DESCRIPTOR,
     EnrollmentDescriber,
-    SegmentationSummary,
+    segmentation_summary,
     within,
 )
 from sim.clock import VirtualClock
@@ -242,7 +242,7 @@ def test_a_catalog_that_is_read_only_is_described_in_memory(catalog: Catalog, mo
 def test_evidence_that_no_program_wrote_is_computed_again(catalog: Catalog, evidence: str) -> None:
     enrollment = complete(catalog, "box")
     expected = described(catalog.database, enrollment, "box")
-    assert SegmentationSummary.of(expected.segmentation).found == VIEWS
+    assert segmentation_summary(expected.segmentation)["found"] == VIEWS
     (seal,) = {seal for seal, what in rows(catalog) if seal == seal_of(enrollment)}
     with catalog.database.write() as transaction:
         transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == SEGMENTATION))

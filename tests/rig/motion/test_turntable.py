@@ -42,20 +42,6 @@ def test_backlash_is_taken_up_on_the_same_side_in_both_directions():
         assert from_above == pytest.approx(from_below, abs=0.15)
 
 
-def test_backlash_is_visible_without_approach():
-    """Without the approach, the backlash is visible: the test above would fail."""
-    noise = NoiseModel(backlash_deg=2.0)
-    with (
-        motion_bench("table.approach_deg=0", "table.backlash_deg=3", noise=noise) as (bench, wires),
-        Turntable(bench) as table,
-    ):
-        table.goto(50.0)
-        from_below = wires.world.table_deg()
-        table.goto(100.0)
-        table.goto(50.0)
-        assert abs(wires.world.table_deg() - from_below) > 1.5
-
-
 def test_table_arrives_although_friction_holds_the_servo_outside_its_window():
     with motion_bench() as (bench, wires), Turntable(bench) as table:
         wires.device.motor.set_friction(0.03)
@@ -161,14 +147,12 @@ def test_within_reach_returns_an_equivalent_angle(target, low, span):
 
 
 def test_motion_needs_torque():
-    with motion_bench() as (bench, _), pytest.raises(NotReady, match="torque"):
-        Turntable(bench).goto(5.0)
-
-
-def test_flight_needs_torque():
-    recorder = TrajectoryRecorder(0.088, 0.5, 0.01, 0.0035)
-    with motion_bench() as (bench, _), pytest.raises(NotReady, match="torque"):
-        Turntable(bench).fly(5.0, Flight(lambda: None, (0.0, 5.0), recorder, 90.0))
+    with motion_bench() as (bench, _):
+        table = Turntable(bench)
+        flight = Flight(lambda: None, (0.0, 5.0), TrajectoryRecorder(0.088, 0.5, 0.01, 0.0035), 90.0)
+        for move in (table.goto, lambda to: table.fly(to, flight)):
+            with pytest.raises(NotReady, match="torque"):
+                move(5.0)
 
 
 def test_shaking_bench_is_not_at_rest():

@@ -19,21 +19,22 @@ from rig.plans.estimate import TimeLeft, even_azimuths, table_angles
 from tests.rig.bench_parts import motion_bench
 
 LIMITS = st.floats(-2000, 0).flatmap(
-    lambda low: st.tuples(st.just(low), st.floats(max(0.0, low + 360.0), low + 4000.0))
+    lambda low: st.tuples(st.just(low), st.floats(0.0, 200.0) | st.floats(max(0.0, low + 360.0), low + 4000.0))
 )
 
 
-@given(views=st.integers(4, 720), limits=LIMITS)
-def test_table_angles_rise_within_every_cable_budget_of_a_revolution(views, limits):
-    azimuths = even_azimuths(views, limits)
-    angles = table_angles(azimuths, limits)
-    assert len(angles) == len(set(azimuths)) == views
-    assert limits[0] - 1e-6 <= angles[0]
-    assert angles[-1] <= limits[1] + 1e-6
+@given(views=st.integers(4, 720), limits=LIMITS, sign=st.sampled_from([1, -1]))
+def test_table_angles_rise_within_every_cable_budget(views, limits, sign):
+    (low, high), step = limits, 360.0 / views
+    azimuths = even_azimuths(views, limits, sign)
+    angles = table_angles(azimuths, limits, sign)
+    assert len(angles) == len(set(azimuths))
+    assert len(angles) == views if high - low >= 360.0 else len(angles) >= min(views, (high - low) / step - 1)
+    assert all(low - 1e-5 <= angle <= high + 1e-5 for angle in angles)
     for before, after in pairwise(angles):
-        assert after - before == pytest.approx(360.0 / views)
+        assert after - before == pytest.approx(step)
     for azimuth, angle in zip(azimuths, angles, strict=True):
-        assert wrap180(azimuth + angle) == pytest.approx(0.0, abs=1e-6)
+        assert wrap180(azimuth - sign * angle) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_table_starts_at_zero_if_the_cable_allows_it():

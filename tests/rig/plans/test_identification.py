@@ -1,6 +1,5 @@
 """Identifications of objects on the simulated bench: poses, unknown objects, slipping platters."""
 
-import numpy as np
 import pytest
 
 import hbr
@@ -10,7 +9,7 @@ from rig.config import load_config
 from rig.core.errors import (
     CatalogError,
 )
-from rig.events.events import Accepted, Decided, Identified, Moved, Ranked
+from rig.events.events import Accepted, Decided, Identified, Moved
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.search.model import model_of
@@ -58,22 +57,6 @@ def test_object_in_any_orientation_is_found_with_the_right_pose(shelf_of_three):
         assert move.rotation_imu_deg == pytest.approx(move.rotation_encoder_deg, abs=4 * move.imu_sigma_deg + 0.3)
     assert answer.travelled_deg == pytest.approx(sum(abs(m.rotation_encoder_deg) for m in moves))
     assert not s.bench.servo.read_condition().torque
-
-
-def test_each_ranking_follows_from_the_accepted_images(shelf_of_three):
-    s, model = shelf_of_three
-    s.operator.next_object = "lamp"
-    x, y, width, height = s.bench.config.view.roi
-    queries, orientations = [], []
-    for event in identify(s.bench, model):
-        if isinstance(event, Accepted):
-            queries.append(hbr.describe(event.image_bgr[y : y + height, x : x + width]))
-            orientations.append(event.azimuth_deg)
-        if isinstance(event, Ranked):
-            again = hbr.retrieve(np.array(queries), np.array(orientations), model.index)
-            assert [c.name for c in event.candidates] == list(again.names)
-            assert [c.score for c in event.candidates] == pytest.approx(list(again.scores / len(queries)), abs=1e-3)
-            assert event.margin == pytest.approx(hbr.score_margin(again, np.array(queries)) / len(queries), abs=1e-3)
 
 
 def test_identification_uses_the_gyro_when_the_platter_slips_a_little(shelf_of_three):

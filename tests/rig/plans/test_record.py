@@ -10,7 +10,7 @@ import pytest
 from rig.catalog import Catalog
 from rig.catalog.results import find_results
 from rig.core.next_steps import Do
-from rig.events.events import Accepted, Identified, NoteCode, Recorded, Warned
+from rig.events.events import Accepted, Identified, NoteCode, ObjectChanged, Recorded, Warned
 from rig.events.wording import note_steps
 from rig.plans.identify import ResultRecorder
 from tests.rig.report.report_samples import identifying
@@ -32,12 +32,8 @@ def recorder(simulated, tmp_path: Path) -> ResultRecorder:
 
 
 def test_each_answer_is_recorded_with_its_sample_and_its_first_image(recorder, tmp_path):
-    samples = iter(("S-1", None))
-    shown = []
-    for event in stream(recorder, times=2):
-        if type(event).__name__ == "Started":
-            recorder.sample = next(samples)
-        shown.append(event)
+    recorder.sample = "S-1"  # of the first object only
+    shown = list(stream(recorder, times=2))
     assert [event for event in shown if isinstance(event, Recorded)] == [Recorded(1, "S-1"), Recorded(2, None)]
     assert all(isinstance(shown[k + 1], Recorded) for k, event in enumerate(shown) if isinstance(event, Identified))
     first = next(event for event in shown if isinstance(event, Accepted))
@@ -48,30 +44,30 @@ def test_each_answer_is_recorded_with_its_sample_and_its_first_image(recorder, t
             assert result.provenance.devices["camera"]
 
 
-def test_sample_is_recorded_for_one_object_only(recorder):
-    recorder.sample = "S-1"
-    assert [event for event in stream(recorder, times=2) if isinstance(event, Recorded)] == [
-        Recorded(1, "S-1"),
-        Recorded(2, None),
-    ]
+def test_result_has_the_image_and_the_views_of_the_new_object(recorder, tmp_path):
+    events = list(identifying())
+    changed = max(k for k, event in enumerate(events) if isinstance(event, Accepted) and event.index == 1) + 1
+    for event in (*events[:changed], ObjectChanged(1, 1, 7.5, 3.0), *events[changed:]):
+        recorder.add(event)
+    new = [event for event in events if isinstance(event, Accepted) and event.index]
+    with Catalog.open(tmp_path, clock=recorder.clock, read_only=True) as catalog:
+        (result,) = find_results(catalog)
+        assert np.array_equal(catalog.read_image(result.image), new[0].image_bgr)
+        assert list(result.azimuths_deg) == [event.azimuth_deg for event in new]
 
 
 def test_answer_is_reported_on_a_full_disk(recorder, monkeypatch):
     def fail(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    *_, answer, warned = stream_with(recorder, monkeypatch, fail)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        *_, answer, warned = stream(recorder)
     assert isinstance(answer, Identified)
     assert isinstance(warned, Warned)
     assert warned.note.code is NoteCode.NOT_RECORDED
     assert "full" in warned.note.values["detail"]
     assert Do.FREE_DISK() in note_steps(warned.note)
-
-
-def stream_with(recorder, monkeypatch, fail):
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fail)
-        return list(stream(recorder))
 
 
 def test_missing_catalog_is_not_created(recorder, tmp_path):

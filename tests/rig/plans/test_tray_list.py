@@ -81,11 +81,12 @@ def test_every_mistake_is_reported_with_its_line(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no column name"),
+        ("", "its columns are missing"),
         ("name,label\n", "no objects"),
-        ("naem,label\nmug,a\n", "line 1: 'naem' is not a column. Did you mean name?"),
-        ("label,note\na,b\n", "no column name"),
-        ("name,name\na,b\n", "twice"),
+        ("naem,label\nmug,a\n", "line 1: its columns are naem, label"),
+        ("name,size\nmug,a\n", "line 1: its columns are name, size"),
+        ("label,note\na,b\n", "must be name"),
+        ("name,name\na,b\n", "each at most once"),
         ('name\n"mug\n', "not CSV"),
         ("name\nmug\nname\xe4\n".encode("latin-1"), "line 3: byte 0xe4"),
         ("name,views\nmug,3\n", "from 4 to 720"),
@@ -141,27 +142,6 @@ def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog)
     assert actions(events) == [("lamp", "replace")]
     assert sum(isinstance(e, Accepted) for e in events) == 4
     assert len({view.session for view in catalog.object("lamp").views}) == 1
-
-
-def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, catalog):
-    s = simulated()
-
-    class Lights(Scripted):
-        def choose(self, question):
-            if question.subject is Subject.FAILURE:
-                s.world.change(light=(1.0, 1.0, 1.0))
-            return super().choose(question)
-
-    operator = Lights(problem=[Choice.CONTINUE])
-    events = []
-    for event in enroll_tray(s.bench, catalog, items("dice"), views=4, operator=operator):
-        if isinstance(event, Accepted) and not any(isinstance(earlier, Accepted) for earlier in events):
-            s.world.change(light=(0.0, 0.0, 0.0))
-        events.append(event)
-    (failure,) = operator.troubles
-    assert failure.startswith("dice: View 2 was rejected")
-    assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
-    assert catalog.object("dice").summary.views == 4
 
 
 def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):

@@ -6,7 +6,6 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import hbr
@@ -78,26 +77,6 @@ def test_search_ends_during_the_rotation_and_can_be_replayed(model: Model, tmp_p
     assert f"enough for an answer from view {enough.index + 1} on: {enough.seconds:.1f} s after the start" in report
     decisions = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
     assert len(decisions) < 1 + len(in_motion)
-
-
-@pytest.mark.nightly
-def test_arc_stays_within_the_cable_budget_and_waits_for_a_pause(model: Model) -> None:
-    world = World(seed=2)
-    angles_deg: list[float] = []
-    with moving(world, "table.limits_deg=[-30, 30]", "table.mode=pan") as bench:
-        events = identify(bench, model, live=lambda _: angles_deg.append(world.table_deg()))
-        paused = False
-        for event in events:
-            if isinstance(event, Decided) and not paused:
-                bench.clock.sleep(40.0)  # the operator pauses before the arc
-                paused = True
-            if isinstance(event, Moved):
-                break
-        events.close()
-        assert not bench.servo.read_condition().torque
-    assert paused
-    assert len(angles_deg) >= 6
-    assert 20 < max(np.abs(angles_deg)) < 31  # an arc without a cable budget is longer
 
 
 @pytest.mark.parametrize(
@@ -174,16 +153,6 @@ def test_guessed_view_does_not_end_the_search(model: Model, monkeypatch: pytest.
         assert first.decision is not None
         reasons.append(first.decision.reason)
     assert reasons == [hbr.StopReason.CONFIDENT, hbr.StopReason.BADLY_SEGMENTED]
-
-
-@pytest.mark.nightly
-def test_unknown_object_is_recognised_within_the_arc(model: Model) -> None:
-    with moving(World(seed=3)) as bench:
-        bench.placer.next_object = "jar-honey"  # type: ignore[attr-defined]
-        *_, answer = identify(bench, model)
-    assert isinstance(answer, Identified)
-    assert answer.outcome is hbr.Outcome.UNKNOWN
-    assert answer.seconds < 4.0
 
 
 def test_search_at_rest_stays_without_calibration_and_motion_asks_for_it(model: Model) -> None:

@@ -1,5 +1,7 @@
 """Strategies of a search: their rotations, and their ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,8 +17,9 @@ from rig.events.events import Ranked, RotationReason
 from rig.search.model import begin_search, model_of
 from rig.search.session import Finish, Rotate, Search, Strategy
 from rig.search.strategies import strategy
+from rig.views.description import DESCRIPTORS, DescribedView
 from tests.fuzzing import examples
-from tests.rig.search.views import seen
+from tests.rig.report.report_samples import moved
 
 PAPERS = ["ahbr", "hbr", "sweep", "random"]
 
@@ -39,7 +42,7 @@ def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, top: i
 def added(
     search: Search, levels: np.ndarray, azimuth_deg: float, *, table_deg: float
 ) -> tuple[Ranked, Rotate | Finish]:
-    search.add(seen(levels), azimuth_deg, table_deg=table_deg)
+    search.add(DescribedView(dict.fromkeys(DESCRIPTORS, levels), None), azimuth_deg, table_deg=table_deg)
     return search.decide()
 
 
@@ -109,23 +112,22 @@ def test_top_limits_the_named_candidates():
         assert len(ranked.candidates) == top
 
 
-def test_the_tree_gives_the_same_answers():
-    known = model(objects=9)
-    for row in known.descriptors[::7]:
-        found = []
-        for index in ("flat", "tree"):
-            search = searching(known, "ahbr", index=index)
-            found.append(added(search, row, 0.0, table_deg=0.0)[0])
-            assert search.index.method == index
-        assert found[0] == found[1]
-
-
 def test_empty_catalog_and_an_unknown_strategy_are_rejected():
     with pytest.raises(CatalogError, match="empty"):
         searching(hbr.Views.empty(), "ahbr")
     with pytest.raises(UsageError) as caught:
         strategy("swep")
     assert "sweep" in caught.value.next_step
+
+
+def test_search_notices_until_its_next_view_that_the_platter_may_have_moved():
+    known = model()
+    search = searching(known, "sweep")
+    for event in (moved(1, 90.0, 90.0), replace(moved(1, 90.0, 90.0), agrees=False)):
+        search.notice(event)
+        assert search._disturbed is (not event.agrees)
+    added(search, known.descriptors[0], 0.0, table_deg=0.0)
+    assert not search._disturbed
 
 
 def test_hmm_ends_when_one_object_is_probable_enough():
