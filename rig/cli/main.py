@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final, Unpack, cast
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from rig.cli.ui.command import show_error, without_color
+from rig.cli.ui.command import show_error
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.cli.ui.options import CommonOptions, show_parameters, spread
 from rig.cli.ui.settings import Settings
@@ -236,9 +236,7 @@ def common(
     **given: Unpack[CommonOptions],
 ) -> None:
     """Read the common options before the command; they can also follow it."""
-    values: dict[str, Any] = {**given}
-    values.pop("no_color")  # `main` has looked for it already
-    ctx.obj = Settings().merged(**values)
+    ctx.obj = Settings().merged(**given)
 
 
 common.__doc__ = None  # or it would replace the help of the app
@@ -248,8 +246,6 @@ app.callback()(common)
 
 def main() -> None:
     """Run the command line."""
-    if "--no-color" in sys.argv:
-        without_color()  # before Typer prints help or a usage error
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that cannot show ° or − shows ? instead of a traceback

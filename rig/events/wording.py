@@ -68,6 +68,13 @@ _ENOUGH: Final = {
     Outcome.UNKNOWN: ", not enrolled",
     Outcome.AMBIGUOUS: ", ambiguous",
 }
+_SPEED_LIMITS: Final = {
+    SpeedLimit.SMEAR: "{value:g} ms exposure allows {speed:.0f} °/s",
+    SpeedLimit.FRAME_RATE: "{value:g} frames/s allow {speed:.0f} °/s",
+    SpeedLimit.TABLE: "table.velocity_dps allows {speed:.0f} °/s",
+    SpeedLimit.GYRO: "the gyro's range of {value:g} °/s allows {speed:.0f} °/s",
+    SpeedLimit.TIME: "frame times that are uncertain by {value:.1f} ms allow {speed:.0f} °/s",
+}
 
 
 def next_steps(event: Event) -> NextSteps:
@@ -91,7 +98,7 @@ def line(event: Event) -> str:
     match event:
         case Started():
             paper = " (the paper's AHBR by CEDD: --strategy ahbr)" if event.descriptor == BENCH_DESCRIPTOR else ""
-            method = [f"{_method(event)}{paper}"] if event.strategy else []
+            method = [f"Method: {event.strategy}, by {event.descriptor}{paper}"] if event.strategy else []
             notes = [(f"Note: {note_words(note)}.", in_words(note_steps(note))) for note in event.notes]
             return "\n".join([*method, *(" ".join(filter(None, note)) for note in notes)])
         case Waiting():
@@ -102,23 +109,21 @@ def line(event: Event) -> str:
             return page_line(event)
 
 
-def _method(event: Started) -> str:
-    return f"Method: {event.strategy}, by {event.descriptor}"
-
-
 def page_line(event: Event) -> str:
     """Return the text of an event for a page or a file, which show its next steps in their own way."""
     match event:
         case Started():
-            method = [_method(event)] if event.strategy else []
+            method = [f"Method: {event.strategy}, by {event.descriptor}"] if event.strategy else []
             return "\n".join([*method, *(f"Note: {note_words(note)}." for note in event.notes)])
         case Moved():
             encoder, asked = (angle_words(angle, 2) for angle in (event.encoder_deg, event.commanded_deg))
             return f"  table at {encoder} (asked {asked}): {move_words(event)}"
         case ScanStarted():
-            return f"  {scan_words(event)}"
+            limit = _SPEED_LIMITS[event.limit].format(value=event.value, speed=event.speed_dps)
+            return f"  one revolution from {angle_words(event.from_deg)} to {angle_words(event.to_deg)}: {limit}"
         case Unwinding():
-            return f"  {unwinding_words(event)}"
+            way = f"from {angle_words(event.from_deg)} back to {angle_words(event.to_deg)}"
+            return f"  Unwinding the cable: the table rotates {way} (the cable allows {angle_range(event.limits_deg)})"
         case Rejected():
             texts = "; ".join(rejection_text(reason, event.evidence) for reason in event.reasons)
             return f"view {event.index + 1}, attempt {event.attempt}: rejected, {texts}"
@@ -130,9 +135,16 @@ def page_line(event: Event) -> str:
                 leaders.append(f"{NOT_ENROLLED} ({percent_words(event.decision.not_enrolled)})")
             return f"  candidates: {', '.join(leaders)} (margin {signed(event.margin, 3)})"
         case FrameUsed():
-            return f"  {_frame_words(event)}"
+            best = f"{event.name} {percent_words(event.probability)}{_ENOUGH[event.outcome]}"
+            where = f"azimuth {azimuth_words(event.azimuth_deg)}°, {event.seconds:.1f} s"
+            rejected = f" ({counted(event.rejected, 'frame')} rejected)" if event.rejected else ""
+            return f"  in motion: {best}; view {event.index + 1}, {where}{rejected}"
         case ObjectChanged():
-            return f"  {change_words(event)}"
+            since = f"view {event.first + 1}" if event.first == event.index else f"views from {event.first + 1} on"
+            return (
+                f"  The object on the table was changed or rotated by hand. The search begins again with {since} "
+                f"(evidence {event.evidence:.1f}, needed {event.needed:.1f})."
+            )
         case Decided():
             return f"  {decision_words(event)} The table rotates to {angle_words(event.target_deg)}."
         case Enrolled():
@@ -155,7 +167,9 @@ def page_line(event: Event) -> str:
             why = filled(event.reason.words, event.error_code)
             return f"{event.number} of {event.of}  {event.name}: skipped, {why}"
         case SimilarObjects():
-            return "\n".join(f"  {words}" for words in similar_objects_words(event))
+            like = [f"{similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in event.objects]
+            found = [_symmetry_words(event), *(f"looks like {one}" for one in like or ["no other enrolled object"])]
+            return "\n".join(f"  {words}" for words in filter(None, found))
         case EmptyTableImage():
             share = "" if event.turning_share is None else f", {percent(event.turning_share)} rotates with the table"
             each = "" if event.images == 1 else f"{event.images} azimuths, each "
@@ -178,13 +192,6 @@ def problem_line(problem: Problem) -> str:
 def _leader(one: Candidate) -> str:
     share = share_words(one)
     return f"{one.name} {one.score:.3f}{f' ({share})' if share else ''} at {azimuth_words(one.pose_deg)}°"
-
-
-def _frame_words(used: FrameUsed) -> str:
-    best = f"{used.name} {percent_words(used.probability)}{_ENOUGH[used.outcome]}"
-    where = f"azimuth {azimuth_words(used.azimuth_deg)}°, {used.seconds:.1f} s"
-    rejected = f" ({counted(used.rejected, 'frame')} rejected)" if used.rejected else ""
-    return f"in motion: {best}; view {used.index + 1}, {where}{rejected}"
 
 
 # -- the parts of the lines --------------------------------------------------------------------------------------------
@@ -258,15 +265,6 @@ def verification_words(verified: Verified) -> str:
     )
 
 
-def change_words(change: ObjectChanged) -> str:
-    """Return that the object changed, as a sentence."""
-    since = f"view {change.first + 1}" if change.first == change.index else f"views from {change.first + 1} on"
-    return (
-        f"The object on the table was changed or rotated by hand. The search begins again with {since} "
-        f"(evidence {change.evidence:.1f}, needed {change.needed:.1f})."
-    )
-
-
 def reason_words(answer: Identified) -> str:
     """Return why a search ended."""
     match answer.reason:
@@ -303,29 +301,6 @@ def move_words(moved: Moved) -> str:
         return words
     bound = "" if moved.bound_deg is None else f" by more than {moved.bound_deg:.2f}°"
     return f"{words}; they differ{bound}, so the gyro value counts"
-
-
-_SPEED_LIMITS: Final = {
-    SpeedLimit.SMEAR: "{value:g} ms exposure allows {speed:.0f} °/s",
-    SpeedLimit.FRAME_RATE: "{value:g} frames/s allow {speed:.0f} °/s",
-    SpeedLimit.TABLE: "table.velocity_dps allows {speed:.0f} °/s",
-    SpeedLimit.GYRO: "the gyro's range of {value:g} °/s allows {speed:.0f} °/s",
-    SpeedLimit.TIME: "frame times that are uncertain by {value:.1f} ms allow {speed:.0f} °/s",
-}
-
-
-def scan_words(scan: ScanStarted) -> str:
-    """Return a sentence that a scan begins, with its speed and the cause that limits it."""
-    limit = _SPEED_LIMITS[scan.limit].format(value=scan.value, speed=scan.speed_dps)
-    return f"one revolution from {angle_words(scan.from_deg)} to {angle_words(scan.to_deg)}: {limit}"
-
-
-def unwinding_words(unwinding: Unwinding) -> str:
-    """Return a sentence that the table frees its cable by a long rotation, with the reason."""
-    return (
-        f"Unwinding the cable: the table rotates from {angle_words(unwinding.from_deg)} back to "
-        f"{angle_words(unwinding.to_deg)} (the cable allows {angle_range(unwinding.limits_deg)})"
-    )
 
 
 def result_words(answer: Identified) -> str:
@@ -401,16 +376,14 @@ def answer_words(answer: Identified) -> str:
     return " ".join([f"{result.removesuffix('.')}.", *rest])
 
 
-def symmetry_words(similar: SimilarObjects) -> str:
+def _symmetry_words(similar: SimilarObjects) -> str:
     """Return what an object's views show about its symmetry; empty if they show nothing."""
-    if similar.period_deg is None or similar.neighbour_similarity is None or similar.period_similarity is None:
+    if similar.neighbour_similarity is None or similar.period_similarity is None or similar.period_deg in (None, 360):
         return ""
     numbers = f"similarity {similar.period_similarity:.3f}, of neighbouring views {similar.neighbour_similarity:.3f}"
     if similar.period_deg == 0:
         return f"looks the same from all sides (smallest {numbers}): its pose cannot be determined"
-    if similar.period_deg < 360:
-        return f"looks the same every {similar.period_deg:g}° ({numbers}): its pose is known up to that angle"
-    return ""
+    return f"looks the same every {similar.period_deg:g}° ({numbers}): its pose is known up to that angle"
 
 
 def similar_object_words(one: SimilarObject) -> str:
@@ -429,15 +402,6 @@ def _arcs_words(arcs_deg: Sequence[tuple[float, float]]) -> str:
     """Return ranges of azimuth: "120–200° and 300°"; empty for more ranges than a reader can use."""
     ends = [(f"{round(a) % 360}", f"{round(b) % 360}") for a, b in arcs_deg]
     return joined([f"{a}°" if a == b else f"{a}–{b}°" for a, b in ends]) if len(ends) <= ARCS_NAMED else ""
-
-
-def similar_objects_words(similar: SimilarObjects) -> list[str]:
-    """Return what an object can be confused with, a line for each finding."""
-    lines = list(filter(None, [symmetry_words(similar)]))
-    lines += [
-        f"looks like {similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects
-    ]
-    return lines if similar.objects else [*lines, "looks like no other enrolled object"]
 
 
 def note_words(note: Note) -> str:

@@ -120,18 +120,10 @@ def _check(name: str | None, tray: Path | None, *, retake: object, **options: ob
             next_step="Give the name of one object, or a list of objects with --list FILE.",
         )
     given = [f"--{key}" for key, value in options.items() if value]
-    if retake and given and tray is None:
-        raise UsageError(
-            f"{', '.join(given)} cannot be used with --retake.",
-            next_step=("The view is taken at rest, at its angle. To take all views again,", Do.ENROLL_AGAIN()),
-        )
-    given = [*(["--retake"] if retake else []), *(option for option in given if option not in ("--views", "--fly"))]
-    if tray is not None and given:
-        raise UsageError(
-            f"{', '.join(given)} cannot be used with --list.",
-            next_step=(
-                "Write labels and notes into the columns of the list. Interrupted enrollments of a list are resumed "
-                "without an option. To replace one object,",
-                Do.ENROLL_AGAIN(),
-            ),
-        )
+    if tray is not None:
+        option, step = "--list", "Write labels and notes into the list; it resumes by itself. To replace one object,"
+        given = [*(one for one in given if one not in ("--views", "--fly")), *(["--retake"] if retake else [])]
+    else:
+        option, step = "--retake", "The view is taken at rest, at its angle. To take all views again,"
+    if given and (tray is not None or retake):
+        raise UsageError(f"{', '.join(given)} cannot be used with {option}.", next_step=(step, Do.ENROLL_AGAIN()))

@@ -36,9 +36,6 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FOLDER", help="Images obj{N}__{angle}.png or .jpg; the catalog by default."),
     ] = None,
-    objects: Annotated[
-        str | None, typer.Option(metavar="FIRST-LAST", help="Only these objects, counted from 1; e.g. 51-100.")
-    ] = None,
     noise: Annotated[
         str | None, typer.Option(help="Noise of the queries: none, gn, gn:VARIANCE, mb, mb:PIXELS:DEGREES, gn+mb.")
     ] = None,
@@ -51,10 +48,6 @@ def evaluate(
     ] = None,
     descriptor: Annotated[
         str | None, typer.Option(metavar="NAME", help="Descriptor of the views: cedd, edges+colours+cedd, ...")
-    ] = None,
-    orientation_errors: Annotated[
-        str | None,
-        typer.Option(metavar="FILE", help="Errors of the orientation: a result imu.rotation of rig calibrate imu."),
     ] = None,
     jobs: JobsOption = None,
     out: Annotated[
@@ -73,11 +66,9 @@ def evaluate(
     try:
         asked = load_experiment(
             experiment,
-            objects=objects,
             noise=noise,
             methods=methods,
             descriptor=None if descriptor is None else known_descriptor(descriptor).name,
-            orientation_errors=orientation_errors,
             seed=settings.seed,
         )
         asked = replace(asked, margin=rule.margin, min_views=rule.min_views)

@@ -37,8 +37,6 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(function)
     def run(ctx: typer.Context, **values: Any) -> None:
         given = {name: values.pop(name) for name in CommonOptions.__annotations__}
-        if given.pop("no_color"):
-            without_color()
         settings = (ctx.obj or Settings()).merged(**given)
         handle_signals()
         try:
@@ -86,11 +84,6 @@ def _long_names_are_usage_errors() -> Iterator[None]:
             next_step="Give a shorter path.",
             evidence={"bytes": len(os.fsencode(error.filename or "")), "name": f"{str(error.filename)[:60]}…"},
         ) from error
-
-
-def without_color() -> None:
-    """Print without colours from now on, in this program and in those that it starts."""
-    os.environ["NO_COLOR"] = "1"
 
 
 def show_error(error: RigError, settings: Settings) -> None:

@@ -33,9 +33,7 @@ else:
 """Python imports this at its start. It sends SIGINT when a module is to be imported, or at a moment of the end."""
 
 
-def interrupted(
-    folder: Path, moment: str, *words: str, handler: object = signal.SIG_DFL
-) -> subprocess.CompletedProcess:
+def interrupted(folder: Path, moment: str, *words: str) -> subprocess.CompletedProcess:
     (folder / "sitecustomize.py").write_text(SITE, encoding="utf-8")
     return subprocess.run(
         [RIG, *words],
@@ -43,7 +41,7 @@ def interrupted(
         cwd=folder,
         capture_output=True,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, handler),
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 
@@ -52,10 +50,6 @@ def interrupted(
     [
         ("rig.cli.main", "--version"),
         ("rig.bench", "goto 90 --bench sim"),
-        pytest.param("rig.core.signals", "goto 90 --bench sim", marks=pytest.mark.nightly),
-        pytest.param("cv2", "goto 90 --bench sim", marks=pytest.mark.nightly),
-        pytest.param("typer", "--version", marks=pytest.mark.nightly),
-        pytest.param("numpy", "goto 90 --bench sim", marks=pytest.mark.nightly),
     ],
 )
 def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words, tmp_path):
@@ -78,14 +72,6 @@ def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, w
     assert done.stdout
 
 
-@pytest.mark.nightly
-def test_ignored_ctrl_c_stays_ignored_until_a_command_begins(tmp_path):
-    done = interrupted(tmp_path, "typer", "config", "show", handler=signal.SIG_IGN)
-    assert (done.returncode, done.stderr) == (0, "")
-    done = interrupted(tmp_path, "platformdirs", "config", "show", handler=signal.SIG_IGN)
-    assert (done.returncode, done.stderr) == (130, "Interrupted.\n")
-
-
 PLAIN = """
 @app.command("new")
 def new():
@@ -104,26 +90,12 @@ def new(settings):
     threading.Event().wait(60)
 """
 
-SLOW = (
-    """
-usual = threading.Thread.start
-def start(thread):
-    usual(thread)
-    threading.Event().wait(0.1)
-threading.Thread.start = start
-"""
-    + DEL
-)
-
 
 @pytest.mark.parametrize(
     ("command", "output", "errors"),
     [
         pytest.param(PLAIN, "closed\n", "", id="command-of-a-package"),
         pytest.param(DEL, "", "Interrupted.\n", id="python-drops-the-exception"),
-        pytest.param(
-            SLOW, "", "Interrupted.\n", id="python-drops-the-exception-on-a-busy-computer", marks=pytest.mark.nightly
-        ),
     ],
 )
 def test_ctrl_c_unwinds_each_command(command, output, errors):

@@ -1,7 +1,6 @@
 """`rig empty-table`, and the question for it at the start of a day."""
 
 import io
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,22 +17,6 @@ from rig.jobs.table_image import refresh_table_image
 from rig.plans.enroll import enroll
 from rig.views.empty_table import empty_table_status
 from tests.small import SMALL, SMALL_WORDS
-
-
-@pytest.mark.nightly
-def test_enrollment_takes_the_image_once_a_day(rig: Callable[..., Any]) -> None:
-    first, second = (rig("enroll", name, "--views", "4") for name in ("dice", "lamp"))
-    assert "Empty-table image:" in first.stderr
-    assert "Empty-table image:" not in second.stderr
-    source = ("--set", "camera.source=/dev/v4l/by-id/usb-HD_Webcam-video-index0")  # another name of the same camera
-    assert "Empty-table image:" not in rig("enroll", "toy-car", "--views", "4", *source).stderr
-    assert rig("empty-table").exit_code == 0
-    assert "photographed the empty table" in rig("log").stdout
-    shown = rig("catalog", "show", "dice")
-    assert "object found in 4 of 4 views, illumination corrected in 4" in shown.stdout
-    reported = json.loads(rig("catalog", "show", "lamp", "--json").stdout)
-    assert reported["segmentation"]["found"] == 4
-    assert reported["views"][0]["segmentation"]["agreement"] > 0.65
 
 
 def test_name_is_checked_before_the_table_is_cleared(rig: Callable[..., Any]) -> None:
@@ -63,9 +46,7 @@ def test_name_is_checked_before_the_table_is_cleared(rig: Callable[..., Any]) ->
 
 def test_rejected_enrollment_leaves_no_object(rig: Callable[..., Any]) -> None:
     assert rig("enroll", "unicorn", "--views", "4").exit_code == 7
-    assert (
-        rig("enroll", "dice", "--views", "4", "--set", "table.zero_deg=90").exit_code == 5
-    )  # the table does not start
+    assert rig("enroll", "dice", "--views", "4", "--set", "table.zero_deg=90").exit_code == 5  # it does not start
     assert len(list(Path("catalog").rglob("*.png"))) == 1  # the empty-table image, which the next enrollment uses
     assert "No objects yet" in rig("catalog", "list").stdout
 
@@ -133,13 +114,13 @@ def test_operator_can_continue_without_the_image(asked: Callable[..., tuple[Any,
     assert "Put toy-car" not in said
 
 
-@pytest.mark.parametrize("options", [{"ask": False}, {"as_json": True}])
-def test_automation_is_never_asked(asked: Callable[..., tuple[Any, str]], options: dict[str, bool]) -> None:
-    table, said = asked(Answers("\n\n\n"), **options)
+@pytest.mark.parametrize(
+    ("terminal", "options"), [(Answers, {"ask": False}), (Answers, {"as_json": True}), (io.StringIO, {})]
+)
+def test_automation_is_never_asked(
+    asked: Callable[..., tuple[Any, str]], terminal: type[io.StringIO], options: dict[str, bool]
+) -> None:
+    table, said = asked(terminal("\n\n\n"), **options)
     assert table is None
     assert said.startswith("Note: there is no empty-table image yet;")
     assert "Take a new empty-table image: `rig empty-table`" in said
-
-
-def test_operator_is_not_asked_without_a_terminal(asked: Callable[..., tuple[Any, str]]) -> None:
-    assert asked(io.StringIO("\n\n\n"))[0] is None

@@ -33,7 +33,6 @@ from rig.events.wording import (
     reason_words,
     share_words,
     similar_object_words,
-    similar_objects_words,
     verification_words,
 )
 from tests.rig.report.report_samples import NAMES, NOTE, identified
@@ -145,13 +144,12 @@ def test_verification_is_put_into_words() -> None:
 def test_similar_objects_are_put_into_words() -> None:
     cup = SimilarObject("cup", ((120.0, 200.0), (300.0, 300.0)), ((210.0, 290.0), (310.0, 110.0)), (), 0.2, 0.99)
     mug = SimilarObjects("mug", 180.0, 0.95, 0.96, (cup,))
-    assert similar_objects_words(mug) == [
-        "looks the same every 180° (similarity 0.960, of neighbouring views 0.950): its pose is known up to that angle",
-        "looks like cup from 120–200° and 300° (similarity up to 0.990)",
-    ]
+    same, like = line(mug).splitlines()
+    assert same.startswith("  looks the same every 180° (similarity 0.960, of neighbouring views 0.950): its pose is ")
+    assert like == "  looks like cup from 120–200° and 300° (similarity up to 0.990)"
     vase = replace(mug, period_deg=0.0, objects=())
-    assert similar_objects_words(vase)[0].startswith("looks the same from all sides")
-    assert similar_objects_words(replace(vase, period_deg=None)) == ["looks like no other enrolled object"]
+    assert line(vase).startswith("  looks the same from all sides")
+    assert line(replace(vase, period_deg=None)) == "  looks like no other enrolled object"
 
 
 AT_HOME, ALL, MANY = ((359.7, 0.3),), ((0.0, 360.0),), tuple((float(a), a + 10.0) for a in (0, 30, 60, 90))

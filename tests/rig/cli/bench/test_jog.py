@@ -1,9 +1,10 @@
-"""`rig jog`: keys rotate the table in steps, and the torque is off at the end."""
+"""`rig jog`: keys rotate the table in steps, and the torque is off after every kind of end."""
 
 import os
-import pty
+import signal
 from collections.abc import Iterable
 from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 
@@ -14,9 +15,22 @@ from rig.events.events import Moved
 from rig.jobs.desk import Remark, Steps
 from rig.jobs.table import JogKey
 from rig.jobs.table import jog as job
-from tests.programs import Program
+from sim.realtime.wire import send_command
+from tests.programs import Program, until
 
 FORWARD, BACK, LARGER, SMALLER = JogKey.FORWARD, JogKey.BACK, JogKey.LARGER_STEP, JogKey.SMALLER_STEP
+
+OF_ITS_TERMINAL = """
+import fcntl, os, termios
+os.setsid()
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+from rig.cli.main import main
+main()
+"""
+"""A terminal sends its signals to the programs that it controls."""
+PATIENT = ("--set", "table.velocity_dps=20", "--set", "servo.retries=10", "--set", "table.watchdog_s=2.4")
+"""The simulated bench answers late on a busy computer."""
+RIGHT, CTRL_C = b"\x1b[C", b"\x03"
 
 
 @pytest.fixture
@@ -72,17 +86,78 @@ def test_impossible_step_is_rejected(jog, simulated, step_deg):
         next(jog(simulated().bench, [FORWARD], step_deg=step_deg))
 
 
+class Terminal:
+    """A terminal with a running `rig jog`: what it shows, and keys."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self._ours, theirs = os.openpty()
+        self.program = Program("jog", *words, code=OF_ITS_TERMINAL, folder=folder, terminal=theirs)
+        os.close(theirs)
+
+    def wait_for(self, text: bytes) -> bytes:
+        shown = b""
+        while text not in shown:
+            shown += os.read(self._ours, 1024)
+        return shown
+
+    def press(self, key: bytes) -> None:
+        os.write(self._ours, key)
+
+    def hang_up(self) -> None:
+        """Close the terminal's window."""
+        os.close(self._ours)
+
+
 @pytest.mark.realtime
 def test_arrow_keys_of_a_terminal_rotate_the_table(rig, tmp_path):
     assert rig("jog").exit_code == 2  # no terminal
-    ours, theirs = pty.openpty()
-    program = Program("jog", "--step", "2", folder=tmp_path, terminal=theirs)
-    os.close(theirs)
-    shown = b""
-    for answer, key in ((b"q end", b"\x1b[C"), (b"2.0", b"\x1b[A"), (b"step 5", b"q"), (b"torque is off", b"")):
-        while answer not in shown:
-            shown += os.read(ours, 1024)
-        shown = shown.partition(answer)[2]
-        os.write(ours, key)
-    assert program.wait(20) == 0
-    os.close(ours)
+    terminal = Terminal(tmp_path, "--step", "2")
+    for answer, key in ((b"q end", RIGHT), (b"2.0", b"\x1b[A"), (b"step 5", b"q")):
+        terminal.wait_for(answer)
+        terminal.press(key)
+    terminal.wait_for(b"torque is off")
+    assert terminal.program.wait(20) == 0
+    terminal.hang_up()
+
+
+def test_jog_ends_when_its_terminal_hangs_up(tmp_path: Path) -> None:
+    terminal = Terminal(tmp_path, "--step", "2", "--bench", "sim")
+    terminal.wait_for(b"q end")
+    terminal.press(RIGHT)
+    terminal.wait_for(b"asked 2.0")
+    terminal.hang_up()
+    assert terminal.program.wait(20) == 128 + signal.SIGHUP
+
+
+@pytest.mark.nightly
+def test_torque_is_off_however_jog_ends_in_motion(running_sim_bench: Path) -> None:
+    config = ("--config", str(running_sim_bench / "rig.toml"))
+
+    def world() -> dict[str, float]:
+        known: dict[str, float] = send_command(running_sim_bench, "status")["world"]
+        return known
+
+    Program("home", "--here", *config).communicate(30)
+    for how, code in (("Ctrl+C", 130), ("hang-up", 128 + signal.SIGHUP), ("kill -9", -signal.SIGKILL), ("q", 0)):
+        begun_deg = world()["table_deg"]
+        terminal = Terminal(running_sim_bench, "--step", "90", *PATIENT, *config)
+        terminal.wait_for(b"q end")
+        terminal.press(RIGHT)
+        # Each answer takes time of the simulated bench.
+        until(lambda begun_deg=begun_deg: world()["torque"] and abs(world()["table_deg"] - begun_deg) > 10, every_s=0.5)
+        if how == "Ctrl+C":
+            terminal.press(CTRL_C)
+        elif how == "hang-up":
+            terminal.hang_up()
+        elif how == "kill -9":
+            terminal.program.kill()
+        else:
+            terminal.wait_for(b"table at")
+            terminal.press(b"q")
+        assert terminal.program.wait(30) == code, how
+        until(lambda: not world()["torque"], every_s=0.5)
+        rotated_deg = abs(world()["table_deg"] - begun_deg)
+        assert rotated_deg > 89 if how == "q" else rotated_deg < 80, how
+        if how != "hang-up":
+            terminal.hang_up()
+        Program("home", "--here", *config).communicate(30)

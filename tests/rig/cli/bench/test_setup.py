@@ -60,14 +60,8 @@ def test_setup_writes_a_commented_file_that_works(home):
     assert again.exit_code == 0, again.output
     assert "is unchanged" in again.stdout
     assert (home / "rig.toml").read_bytes() == before
-
-
-def test_new_file_gets_the_name_of_the_port_that_stays(parts, home):
-    """The default port is the same device, but the next one that is connected may get its name."""
-    (port,) = parts.context.computer.serial_ports()
-    assert port.path == RigConfig().servo.port
-    rig("setup")
-    assert load_config(home / "rig.toml").servo.port.startswith("/dev/serial/by-id/")
+    written, examined = (json.loads(line) for line in rig("setup", "--json").stdout.splitlines())
+    assert (written["written"], examined["bad"]) == (False, 0)
 
 
 def test_setup_of_the_simulated_bench_keeps_the_devices_of_the_real_one(home):
@@ -87,8 +81,10 @@ def test_setup_of_the_simulated_bench_keeps_the_devices_of_the_real_one(home):
 def test_new_file_belongs_to_the_bench_that_was_set_up(parts, home):
     (home / "rig.toml").write_text('default_bench = "sim"\n[table]\nvelocity_dps = 45\n', encoding="utf-8")
     rig("setup", "--config", "real.toml")
-    assert load_config(home / "real.toml").default_bench == "hardware"
-    assert load_config(home / "real.toml").table.velocity_dps == 90
+    config = load_config(home / "real.toml")
+    assert (config.default_bench, config.table.velocity_dps) == ("hardware", 90)
+    # The default port is the same device, but the next one that is connected may get its name.
+    assert parts.context.computer.serial_ports()[0].path == RigConfig().servo.port != config.servo.port
     rig("setup", "--config", "sim.toml", "--set", "default_bench=sim")
     assert load_config(home / "sim.toml").default_bench == "sim"
 
@@ -109,13 +105,6 @@ def test_existing_file_keeps_comments_and_settings(parts, home):
     assert "rig servo settings --write" in done.stdout
 
 
-def test_broken_file_is_rejected_and_unchanged(home):
-    (home / "rig.toml").write_text("[servo\n", encoding="utf-8")
-    done = rig("setup", "--bench", "sim")
-    assert done.exit_code == 3
-    assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo\n"
-
-
 def test_one_of_several_servos_is_not_chosen(parts, home):
     parts.add_servo(7, 1_000_000, "xm430_w350")
     done = rig("setup")
@@ -123,29 +112,17 @@ def test_one_of_several_servos_is_not_chosen(parts, home):
     assert "\nid =" not in (home / "rig.toml").read_text(encoding="utf-8")
 
 
-def test_setup_json_is_one_object_per_line(home):
-    done = rig("setup", "--bench", "sim", "--json")
-    written, examined = (json.loads(line) for line in done.stdout.splitlines())
-    assert written["written"] is True
-    assert "servo.port" in written["settings"]
-    assert examined["bad"] == 0
-
-
 # -- doctor and find --------------------------------------------------------------------------------------------------
 
 
 def test_doctor_uses_the_defaults_if_the_configuration_is_broken(home):
     (home / "rig.toml").write_text("[servo]\nbaud = 3\nprot = 1\n", encoding="utf-8")
+    assert rig("setup", "--bench", "sim").exit_code == 3
+    assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo]\nbaud = 3\nprot = 1\n"
     done = rig("doctor", "--bench", "sim")
     assert done.exit_code == 3
-    assert done.stdout.count("→ Check the configuration: `rig config check`.") == 2
+    assert done.stdout.count("→ Check the configuration: `rig config show`.") == 2
     assert "XL430-W250" in done.stdout
-
-
-def test_udev_prints_only_rules(home):
-    done = rig("doctor", "--udev", "--bench", "sim")
-    assert done.exit_code == 0
-    assert all(line.startswith(("#", "ACTION", "SUBSYSTEM")) for line in done.stdout.splitlines())
 
 
 def test_find_prints_valid_settings(parts, home):
@@ -156,6 +133,8 @@ def test_find_prints_valid_settings(parts, home):
     assert (config.servo.baud, config.servo.id, config.imu.address) == (57_600, 1, 0x68)
     reported = json.loads(rig("find", "--json").stdout)
     assert reported["settings"]["camera.source"] == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
+    udev = rig("doctor", "--udev").stdout
+    assert all(line.startswith(("#", "ACTION", "SUBSYSTEM")) for line in udev.splitlines())
 
 
 def test_find_detects_a_rig_head(home):

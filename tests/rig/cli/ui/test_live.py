@@ -4,6 +4,7 @@ import io
 import signal
 from collections.abc import Iterable
 from dataclasses import replace
+from datetime import UTC, datetime
 from itertools import islice
 
 import pytest
@@ -15,7 +16,6 @@ from rig.cli.ui.live import LiveView
 from rig.cli.ui.prompts import TerminalOperator
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
-from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
 from rig.events.events import Event, FrameUsed, Item, SimilarObjects
 from rig.motion.move import MotionTimes
@@ -87,7 +87,10 @@ def test_frames_are_lines_in_a_pipe_and_at_a_terminal_only_the_last_line(shown):
     assert is_terminal(text) or "enough to end the search" in text
 
 
-STOPPING = """
+def test_sigtstp_pauses_between_two_views_and_sigcont_resumes(tmp_path):
+    (tmp_path / "rig.toml").write_text(SMALL_FILE, encoding="utf-8")
+    # as by Ctrl+Z; the program sends it to itself, so that a busy test acts before the third view
+    code = """
 import os, signal
 from rig.catalog import OpenEnrollment
 from rig.cli.main import main
@@ -95,27 +98,15 @@ from rig.cli.main import main
 add, added = OpenEnrollment.add, []
 
 def add_and_stop(*arguments):
-    stored = add(*arguments)
-    added.append(stored)
+    added.append(add(*arguments))
     if len(added) == 2:
-        os.kill(os.getpid(), signal.SIGSTOP)
-    return stored
+        os.kill(os.getpid(), signal.SIGTSTP)
+    return added[-1]
 
 OpenEnrollment.add = add_and_stop
 main()
 """
-"""The program stops itself when it has stored its second view: a busy test acts before the third."""
-
-
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "rig.toml").write_text(SMALL_FILE, encoding="utf-8")
-    return tmp_path
-
-
-def test_sigtstp_pauses_between_two_views_and_sigcont_resumes(folder):
-    code = STOPPING.replace("SIGSTOP", "SIGTSTP")  # as by Ctrl+Z
-    process = Program("enroll", "dice", "--views", "5", code=code, folder=folder)
+    process = Program("enroll", "dice", "--views", "5", code=code, folder=tmp_path)
     process.wait_until_stopped()
     process.send_signal(signal.SIGCONT)
     rest, errors = process.communicate(timeout=60)
@@ -135,40 +126,30 @@ def choose(monkeypatch, capsys):
     return run
 
 
-@pytest.fixture
-def asked(choose):
-    def run(answers: str, kept: ObjectSummary | None = None) -> tuple[Choice, str]:
-        return choose(answers, next_object(TrayItem(2, "mug", "kitchen"), 3, 25, kept))
-
-    return run
+KEPT = ObjectSummary("mug", "", "", datetime(2026, 1, 1, tzinfo=UTC), None, 0, 31)
+NEXT, AGAIN = (next_object(TrayItem(2, "mug", "kitchen"), 3, 25, kept) for kept in (None, KEPT))
+FAILED = after_error(ViewRejected("View 3 was rejected: too dark.", next_step="Check the light."), TrayItem(2, "mug"))
 
 
-def test_operator_is_asked_for_the_next_object(asked):
-    answer, question = asked("\n")
-    assert answer is Choice.CONTINUE
-    assert question.startswith("3 of 25: put mug (kitchen) on the table")
-    assert "\a" not in question  # a pipe makes no sound
-    assert asked("s\n")[0] is Choice.SKIP
-    assert asked("what?\nn\nQ\n")[0] is Choice.STOP  # after an invalid answer, the question is asked again
-    assert asked("")[0] is Choice.STOP
-
-
-def test_operator_is_asked_whether_an_interrupted_object_was_moved(asked):
-    clock = SystemClock()
-    kept = ObjectSummary("mug", "", "", clock.utc(), None, 0, 31)
-    answer, question = asked("n\n", kept)
-    assert answer is Choice.RESTART
-    assert "31 views of an interrupted enrollment" in question
-    assert asked("\n", kept)[0] is Choice.CONTINUE
-
-
-def test_operator_decides_about_an_object_that_failed(choose):
-    error = ViewRejected("View 3 was rejected: too dark.", next_step="Check the light.")
-    for said, expected in (("\n", Choice.CONTINUE), ("s\n", Choice.SKIP), ("q\n", Choice.STOP)):
-        choice, question = choose(said, after_error(error, TrayItem(2, "mug")))
-        assert choice is expected
-        assert "too dark" in question
-        assert "Check the light" in question
+@pytest.mark.parametrize(
+    ("question", "answers", "choice", "words"),
+    [
+        (NEXT, "\n", Choice.CONTINUE, "3 of 25: put mug (kitchen) on the table"),
+        (NEXT, "s\n", Choice.SKIP, ""),
+        (NEXT, "what?\nn\nQ\n", Choice.STOP, ""),  # after an invalid answer, the question is asked again
+        (NEXT, "", Choice.STOP, ""),
+        (AGAIN, "n\n", Choice.RESTART, "31 views of an interrupted enrollment"),
+        (AGAIN, "\n", Choice.CONTINUE, ""),
+        (FAILED, "\n", Choice.CONTINUE, "too dark"),
+        (FAILED, "s\n", Choice.SKIP, "Check the light"),
+        (FAILED, "q\n", Choice.STOP, ""),
+    ],
+)
+def test_operator_answers_at_the_terminal(choose, question, answers, choice, words):
+    answer, asked = choose(answers, question)
+    assert answer is choice
+    assert words in asked
+    assert "\a" not in asked  # a pipe makes no sound
 
 
 def test_unreadable_input_is_a_usage_error(monkeypatch):

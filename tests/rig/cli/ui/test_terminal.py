@@ -70,20 +70,13 @@ def test_everything_that_a_command_prints_is_neutral(text):
         table = Table(text)
         table.add_row(Text(text))
         screen.print(table)
+        Settings().print_json({"label": text})
 
     with pytest.MonkeyPatch.context() as patch:
         out, err = shown(patch, show)
     assert is_safe(out)
     assert is_safe(err)
-
-
-@fuzz_settings(0.2)
-@given(TEXT)
-def test_json_stays_json_and_is_neutral(text):
-    with pytest.MonkeyPatch.context() as patch:
-        out, _ = shown(patch, lambda: Settings().print_json({"label": text}))
-    assert is_safe(out)
-    assert json.loads(out) == {"label": text}
+    assert json.loads(out.splitlines()[-1]) == {"label": text}  # JSON stays JSON
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
@@ -162,13 +155,6 @@ def test_closed_output_is_no_error(tmp_path):
         ["sh", "-c", '"$@" >&-', "sh", *RIG, "config", "show"], stderr=subprocess.PIPE, text=True, cwd=tmp_path
     )
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_streams_are_restored():
-    before = sys.stdout, sys.stderr
-    with pytest.raises(KeyboardInterrupt), guarded_output():
-        raise KeyboardInterrupt
-    assert (sys.stdout, sys.stderr) == before
 
 
 def test_progress_of_a_scan_is_replaced_and_cannot_control_the_terminal(monkeypatch):
