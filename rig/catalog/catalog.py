@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import bindparam, delete, select
+from sqlalchemy import and_, bindparam, delete, or_, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
@@ -21,7 +21,7 @@ from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
 from rig.catalog.opening import open_database
 from rig.catalog.records import MAX_VIEWS, EnrollmentStatus, Provenance, as_json, checked_texts, clean_name, is_plan
-from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
+from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary, State
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
@@ -95,12 +95,14 @@ class Catalog(AbstractContextManager["Catalog"]):
     def objects(self, *, deleted: bool = False) -> list[ObjectSummary]:
         """Return the objects in use in the order in which they were added, or the deleted ones that can be restored."""
         with self.database.read() as transaction:
-            return state.summaries(transaction, deleted=deleted)
+            found = State(transaction)
+            return found.summaries(found.deleted() if deleted else found.in_use())
 
     def summary(self, name: str) -> ObjectSummary:
         """Return an object without its enrollments and views; errors as for `object`."""
         with self.database.read() as transaction:
-            return state.summaries(transaction, object_id=state.find(transaction, name).object_id)[0]
+            found = State(transaction)
+            return found.summaries([found.find(name)])[0]
 
     def object(self, name: str) -> ObjectDetails:
         """Return an object with its enrollments and views.
@@ -108,22 +110,23 @@ class Catalog(AbstractContextManager["Catalog"]):
         Raises `ObjectNotFound`: there is no object of that name. `CatalogDamaged`: an enrollment of it is missing.
         """
         with self.database.read() as transaction:
-            found = state.find(transaction, name)
-            state.check_present(transaction, found.object_id)
-            (summary,) = state.summaries(transaction, object_id=found.object_id)
-            return ObjectDetails(summary, tuple(state.enrollments(transaction, state.of_object(found.object_id))))
+            found = State(transaction)
+            known = found.find(name)
+            found.check_present(known.object_id)
+            return ObjectDetails(found.summaries([known])[0], tuple(found.enrollments_of(known.object_id)))
 
     def first_views(self) -> dict[str, int]:
         """Return the id of one view of each object in use, to show the object by."""
         with self.database.read() as transaction:
-            names = {one.enrollment_id: one.name for one in state.used(transaction)}
-            rows = state.first_views(transaction, View.enrollment_id, View.id)
+            found = State(transaction)
+            names = {one.enrollment_id: one.name for one in found.used()}
+            rows = found.first_views(View.enrollment_id, View.id)
             return {names[enrollment_id]: view_id for enrollment_id, view_id in rows}
 
     def version(self) -> str:
         """Return a digest of what searches compare with, SHA-256: another one after every change of the objects."""
         with self.database.read() as transaction:
-            return state.version(transaction)
+            return State(transaction).version()
 
     def damage(self) -> CatalogDamaged | None:
         """Return the error that an object is not as it was stored; None if all are.
@@ -132,7 +135,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         try:
             with self.database.read() as transaction:
-                state.check(transaction)
+                State(transaction).check_everything()
         except CatalogDamaged as error:
             return error
         return None
@@ -175,10 +178,11 @@ class Catalog(AbstractContextManager["Catalog"]):
         name = clean_name(name)
         checked_texts(label, note)
         with self.database.read() as transaction:
+            found = State(transaction)
             if resume:
-                state.unfinished(transaction, state.find(transaction, name))
-            elif not replace and (known := state.state_of(transaction, name)) is not None:
-                state.check_not_enrolled(transaction, known)
+                found.unfinished(found.find(name))
+            elif not replace and (known := found.named(name)) is not None:
+                found.check_not_enrolled(known)
 
     def known_objects(self) -> list[ObjectSummary]:
         """Return the objects that need not be enrolled: those in use. `rig.catalog.journal` adds those of a server."""
@@ -217,11 +221,12 @@ class Catalog(AbstractContextManager["Catalog"]):
         png = None if empty_table is None else images.encode(empty_table)
         now = self.clock.utc()
         with self.database.write() as transaction:
-            known = state.state_of(transaction, name)
+            before = State(transaction)
+            known = before.named(name)
             if known is not None:
                 if not replace:
-                    state.check_not_enrolled(transaction, known)
-                state.end_current(transaction, self.clock, known, EnrollmentStatus.IN_PROGRESS)
+                    before.check_not_enrolled(known)
+                before.end_current(self.clock, known, EnrollmentStatus.IN_PROGRESS)
             object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
             assert object_id is not None
             # The enrollment, its digest, and the line of the log are one fact: all are written, or none.
@@ -250,7 +255,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         Raises `ObjectNotFound`: there is no object of that name.
         """
         with self.database.read() as transaction:
-            return state.of_status(transaction, state.find(transaction, name), EnrollmentStatus.IN_PROGRESS)
+            found = State(transaction)
+            return found.of_status(found.find(name), EnrollmentStatus.IN_PROGRESS)
 
     def resume(
         self, name: str, *, provenance: Provenance, empty_table: NDArray[np.uint8] | None = None
@@ -262,9 +268,9 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         png = None if empty_table is None else images.encode(empty_table)
         with self.database.write() as transaction:
-            found = state.find(transaction, name)
-            enrollment = state.unfinished(transaction, found).enrollment
-            name = str(found.object_name)
+            found = State(transaction)
+            known = found.find(name)
+            enrollment, name = found.unfinished(known).enrollment, str(known.object_name)
             details = {"enrollment_id": enrollment.id}
             log.append(transaction, self.clock, Action.ENROLLMENT_RESUMED, name, details=details)
             return self._start_session(transaction, enrollment, name, provenance, png)
@@ -279,10 +285,11 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         new_name = clean_name(new_name)
         with self.database.write() as transaction:
-            known = state.find(transaction, name)
+            found = State(transaction)
+            known = found.find(name)
             if new_name == known.object_name:
                 return
-            state.check_free(transaction, new_name)
+            found.check_free(new_name)
             before = {"before": known.object_name}
             log.append(transaction, self.clock, Action.RENAMED, new_name, **state.columns(known), details=before)
 
@@ -293,7 +300,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         texts = checked_texts(label, note)
         with self.database.write() as transaction:
-            known = state.find(transaction, name)
+            known = State(transaction).find(name)
             if texts:
                 columns = state.columns(known, texts)
                 log.append(transaction, self.clock, Action.LABELLED, known.object_name, **columns, details=texts)
@@ -304,7 +311,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         Raises `ObjectNotFound`: there is no object of one of these names.
         """
         with self.database.write() as transaction:
-            for known in [state.find(transaction, name) for name in dict.fromkeys(names)]:
+            for known in map(State(transaction).find, dict.fromkeys(names)):
                 columns = state.columns(known, deleted=True)
                 log.append(transaction, self.clock, Action.DELETED, known.object_name, **columns)
 
@@ -315,8 +322,9 @@ class Catalog(AbstractContextManager["Catalog"]):
         name.
         """
         with self.database.write() as transaction:
-            known = state.find(transaction, name, deleted=True)
-            state.check_free(transaction, str(known.object_name))
+            found = State(transaction)
+            known = found.find(name, deleted=True)
+            found.check_free(str(known.object_name))
             log.append(transaction, self.clock, Action.UNDELETED, known.object_name, **state.columns(known))
 
     # The log
@@ -355,11 +363,16 @@ class Catalog(AbstractContextManager["Catalog"]):
         return OpenEnrollment(self, enrollment, name, session)
 
 
-# Each view asks these. To build a statement takes longer than to execute it.
-_STATUS = (
-    select(state.Ended.status)
-    .join(Enrollment, Enrollment.id == state.Ended.enrollment_id)
-    .where(state.IS_STATUS, Enrollment.id == bindparam("id"))
+# Each view asks these, and so not for the whole state. To build a statement takes longer than to execute it.
+_LINES = (
+    select(Entry.deleted, Entry.status)
+    .where(
+        or_(
+            and_(Entry.object_id == bindparam("object_id"), Entry.deleted.is_not(None)),
+            and_(Entry.enrollment_id == bindparam("id"), Entry.status.is_not(None)),
+        )
+    )
+    .order_by(Entry.id)
 )
 _PRESENT = select(View.index).where(View.enrollment_id == bindparam("id"))
 
@@ -437,8 +450,7 @@ class OpenEnrollment:
         database, clock = self.catalog.database, self.catalog.clock
         with database.read() as transaction:
             self._check_in_progress(transaction)
-            (found,) = state.enrollments(transaction, Enrollment.id == self.id)
-        enrollment = found.enrollment
+            enrollment = State(transaction).enrollments(Enrollment.id == self.id)[0].enrollment
         if missing := enrollment.missing:
             raise CatalogError(
                 f"{len(missing)} of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r} "
@@ -449,17 +461,19 @@ class OpenEnrollment:
         described(database, enrollment, self.object_name, held=self._held)
         with database.write() as transaction:
             self._check_in_progress(transaction)
-            known = state.by_id(transaction, enrollment.object_id)
-            state.end_current(transaction, clock, known, EnrollmentStatus.COMPLETE)
-            done = state.EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, clock.utc())
+            before = State(transaction)
+            known = before.by_id(enrollment.object_id)
+            before.end_current(clock, known, EnrollmentStatus.COMPLETE)
+            done = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, clock.utc())
             log.append(transaction, clock, Action.ENROLLED, known.object_name, **state.ending(done))
 
     def abandon(self) -> None:
         """Abandon the enrollment. Its images stay, and the complete enrollment before it stays in use."""
         with self.catalog.database.write() as transaction:
             self._check_in_progress(transaction)
-            known = state.by_id(transaction, self.enrollment.object_id)
-            state.end_current(transaction, self.catalog.clock, known, EnrollmentStatus.IN_PROGRESS)
+            before = State(transaction)
+            known = before.by_id(self.enrollment.object_id)
+            before.end_current(self.catalog.clock, known, EnrollmentStatus.IN_PROGRESS)
 
     def discard(self) -> None:
         """Remove an enrollment without views; an object that has no other enrollment goes with it.
@@ -477,7 +491,7 @@ class OpenEnrollment:
             transaction.execute(delete(Enrollment).where(Enrollment.id == self.id))
             object_id = self.enrollment.object_id
             others = transaction.scalar(select(Enrollment.id).where(Enrollment.object_id == object_id).limit(1))
-            known = state.by_id(transaction, object_id)
+            known = State(transaction).by_id(object_id)
             gone = state.columns(known, deleted=True)
             log.append(
                 transaction,
@@ -494,15 +508,19 @@ class OpenEnrollment:
         return tuple(index for index in range(len(self.planned_azimuth_deg)) if index not in present)
 
     def _check_in_progress(self, transaction: Transaction) -> None:
-        if state.by_id(transaction, self.enrollment.object_id).deleted:
+        lines = transaction.execute(_LINES, {"id": self.id, "object_id": self.enrollment.object_id}).all()
+        deleted = [line.deleted for line in lines if line.deleted is not None]
+        statuses = [line.status for line in lines if line.status is not None]
+        if deleted[-1:] == [True]:
             raise CatalogError(
                 f"{self.object_name!r} was deleted during its enrollment.",
                 next_step=(Do.UNDELETE(name=self.object_name), Do.CONTINUE_ENROLLMENT(name=self.object_name)),
             )
-        status = transaction.scalar(_STATUS, {"id": self.id})
-        if status != EnrollmentStatus.IN_PROGRESS:
+        is_there = transaction.scalar(select(Enrollment.id).where(Enrollment.id == self.id)) is not None
+        if not is_there or statuses[-1:] != [EnrollmentStatus.IN_PROGRESS]:
+            status = statuses[-1] if is_there and statuses else "gone"
             raise CatalogError(
-                f"The enrollment of {self.object_name!r} is {status or 'gone'}, not in progress.",
+                f"The enrollment of {self.object_name!r} is {status}, not in progress.",
                 next_step="Start a new one.",
             )
 

@@ -17,7 +17,6 @@ import hbr
 from hbr.dense.pixel_fit import LocalView
 from hbr.dense.session import near
 from rig.calibrations.store import CALIBRATIONS
-from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
 from rig.catalog.describing import (
@@ -32,6 +31,7 @@ from rig.catalog.describing import (
 from rig.catalog.facts import Enrollment, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, processes
 from rig.catalog.records import Region
+from rig.catalog.state import State
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
@@ -52,12 +52,13 @@ def views(
     # The descriptors of every enrolled view are computed from one segmentation.
     together = DESCRIPTORS if kind.name in DESCRIPTORS and not kind.whole_image else (kind.name,)
     with catalog.database.read() as transaction:
-        wanted = state.used(transaction, checked=True)
+        state = State(transaction)
+        wanted = state.used(checked=True)
         found = stored_contents(transaction, [one.seal for one in wanted], (kind.name,))[kind.name]
         missing = []
         for one in wanted:
             if one.seal not in found:
-                (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
+                (known,) = state.enrollments(Enrollment.id == one.enrollment_id)
                 missing.append((one.name, known.enrollment))
     report = progress or (lambda _: None)
     if missing:
@@ -120,7 +121,7 @@ def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, 
     """
     sessions, found = Session.__table__.c, set()
     with catalog.database.read() as transaction:
-        ids = {one.enrollment_id for one in state.used(transaction)}
+        ids = {one.enrollment_id for one in State(transaction).used()}
         rows = transaction.execute(
             select(sessions.enrollment_id, sessions.conditions, View.region)
             .join(View, (View.enrollment_id == sessions.enrollment_id) & (View.session == sessions.number))

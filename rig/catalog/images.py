@@ -49,6 +49,9 @@ class Images:
     Every method raises an `OSError` with the reason if it fails, and `CatalogUnavailable` if a store does not answer.
     """
 
+    are_kept = True
+    """Whether the catalog has its images, and not only the rows that name them."""
+
     def __init__(self, root: Path) -> None:
         self.root = root
 

@@ -1,10 +1,10 @@
-"""The images of a transfer: each is read, compared with its name, decoded, described and stored, in several processes.
+"""The images of a transfer: each is read, compared with its name, decoded, described, and later stored.
 
 A file that cannot be used is rejected, with the reason.
 """
 
 import zlib
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -18,6 +18,9 @@ from rig.catalog.jobs import JobProgress, processes
 from rig.core.errors import CatalogDamaged, CatalogError
 from rig.core.processes import map_in_processes
 from rig.views.image_files import BadImage, decode
+
+Read = Callable[[str], bytes]
+"""Returns the bytes under the name of an image, unchecked. It can be sent to other processes."""
 
 
 class ImportProblem(StrEnum):
@@ -46,7 +49,6 @@ class RejectedFile:
         return f"{self.path} {self.reason}"
 
 
-OTHER_IMAGE: Final = "is not the stored image"
 _READ_ERRORS: Final = (
     OSError,
     BadZipFile,
@@ -56,30 +58,15 @@ _READ_ERRORS: Final = (
     ValueError,
     KeyError,
     zlib.error,
+    CatalogDamaged,  # a link that leads out of a catalog
 )
-
-
-@dataclass(frozen=True)
-class Reading:
-    """How images are read."""
-
-    content: Callable[[str], bytes]
-    """Returns the bytes under a name."""
-    store: Images | None
-    """Gets the images; None stores none."""
-    is_named: bool
-    """The names are those of a catalog, so the bytes can be compared with them."""
-    decodes: bool
-    """Each image is also decoded, and the views are described."""
-    descriptors: tuple[str, ...] = ()
-    """Those that describe them. A view that cannot be described would stop every later search, so it is rejected."""
 
 
 @dataclass
 class ReadImages:
     """What was read: name and size in bytes of each image, or the reason why it cannot be used.
 
-    ``contents`` are the descriptions by the names of the objects (`describing.computed`), of those that were decoded.
+    ``contents`` are the descriptions by the names of the objects (`describing.computed`).
     """
 
     images: dict[str, tuple[str, int]] = field(default_factory=dict)
@@ -87,24 +74,42 @@ class ReadImages:
     contents: dict[str, dict[str, bytes]] = field(default_factory=dict)
 
 
+def images_of(enrollment: Enrollment) -> Iterator[tuple[str, int]]:
+    """Yield the images of an enrollment and their sizes: of its views, and of the empty table."""
+    yield from ((view.image, view.image_bytes) for view in enrollment.views)
+    for session in enrollment.sessions:
+        if session.empty_table is not None:
+            yield session.empty_table, session.empty_table_bytes or 0
+
+
 def read_images(
-    reading: Reading, enrollments: Mapping[str, Enrollment], *, strict: bool, jobs: int | None
+    read: Read,
+    enrollments: Mapping[str, Enrollment],
+    descriptors: tuple[str, ...],
+    *,
+    are_named: bool,
+    strict: bool,
+    jobs: int | None,
 ) -> Generator[JobProgress, None, ReadImages]:
-    """Read the images of objects' enrollments; with ``strict`` it ends at the first one with a rejected image."""
-    total, done = sum(len(_images(one)) for one in enrollments.values()), 0
+    """Read, decode and describe the images of objects' enrollments, in several processes.
+
+    If they ``are_named`` as in a catalog, they are compared with their names. With ``strict`` it ends at the first
+    object with a rejected image. A view that the ``descriptors`` cannot describe would stop every later search, so it
+    is rejected, too.
+    """
+    total, done = sum(len(dict(images_of(one))) for one in enrollments.values()), 0
     found = ReadImages()
     yield JobProgress(0, total)
     parts = []
-    for (name, enrollment), part in map_in_processes(
-        partial(_read, reading), enrollments.items(), processes(jobs, total)
-    ):
+    work = partial(_read, read, are_named, descriptors)
+    for (name, enrollment), part in map_in_processes(work, enrollments.items(), processes(jobs, total)):
         parts.append((name, part))
         found.images |= part.images
         found.rejected |= part.rejected
         found.contents |= part.contents
         if strict and found.rejected:
             break
-        done += len(_images(enrollment))
+        done += len(dict(images_of(enrollment)))
         yield JobProgress(done, total)
     for name, part in parts:  # an image that one object cannot use is left out of the others, too
         if not found.rejected.keys().isdisjoint(part.images):
@@ -114,45 +119,60 @@ def read_images(
     return found
 
 
-def _images(enrollment: Enrollment) -> list[str]:
-    tables = [session.empty_table for session in enrollment.sessions if session.empty_table is not None]
-    return list(dict.fromkeys([*(view.image for view in enrollment.views), *tables]))
+def store_images(
+    read: Read, store: Images, images: Mapping[str, tuple[str, int]]
+) -> Generator[JobProgress, None, list[RejectedFile]]:
+    """Store images that were read before, durably; it ends at the first one that is no longer the same."""
+    for done, (image, (name, _)) in enumerate(images.items() if store.are_kept else (), 1):
+        content = checked(read, image, name)
+        if isinstance(content, RejectedFile):
+            return [content]
+        store.put(content, settled=False)
+        yield JobProgress(done, len(images))
+    if store.are_kept:
+        store.settle({name for name, _ in images.values()})
+    return []
 
 
-def _read(reading: Reading, one: tuple[str, Enrollment]) -> ReadImages:
+def checked(read: Read, image: str, name: str | None) -> bytes | RejectedFile:
+    """Return the bytes of an image, or why it cannot be used. ``name`` is what they are called in a catalog."""
+    try:
+        content = read(image)
+    except _READ_ERRORS as error:
+        return RejectedFile(image, ImportProblem.UNREADABLE, f"cannot be read: {error}")
+    if name is not None and name_of(content) != name:
+        return RejectedFile(image, ImportProblem.OTHER_IMAGE, "is not the stored image")
+    return content
+
+
+def _read(read: Read, are_named: bool, descriptors: tuple[str, ...], one: tuple[str, Enrollment]) -> ReadImages:
     """Read the images of an object's enrollment, and describe its views. Runs in a worker process."""
-    name_of_object, enrollment = one
+    name, enrollment = one
     found = ReadImages()
     held: dict[str, describing.Pixels] = {}
-    for image in _images(enrollment):
-        code, reason = None, ""
-        try:
-            content = reading.content(image)
-            name = name_of(content)
-            if reading.is_named and name != image:
-                code, reason = ImportProblem.OTHER_IMAGE, OTHER_IMAGE
-            elif reading.decodes:
+    for image in dict(images_of(enrollment)):
+        content = checked(read, image, image if are_named else None)
+        if not isinstance(content, RejectedFile):
+            try:
                 describing.hold(held, image, decode(content))
-        except BadImage as error:
-            code, reason = ImportProblem.INVALID_IMAGE, f"cannot be used: {error}"
-        except (CatalogDamaged, *_READ_ERRORS) as error:  # a link that leads out of a catalog is damage
-            code, reason = ImportProblem.UNREADABLE, f"cannot be read: {error}"
-        if code is not None:
-            found.rejected[image] = RejectedFile(image, code, reason)
-            continue
-        if reading.store is not None:
-            reading.store.put(content, settled=False)
-        found.images[image] = name, len(content)
-    if reading.decodes:
-        _describe(reading, name_of_object, enrollment, held, found)
+                found.images[image] = name_of(content), len(content)
+                continue
+            except BadImage as error:
+                content = RejectedFile(image, ImportProblem.INVALID_IMAGE, f"cannot be used: {error}")
+        found.rejected[image] = content
+    pixels = describing.reader(lambda image: decode(read(image)), held)
+    _describe(pixels, name, enrollment, descriptors, found)
     return found
 
 
 def _describe(
-    reading: Reading, name: str, enrollment: Enrollment, held: Mapping[str, describing.Pixels], found: ReadImages
+    pixels: Callable[[str], describing.Pixels],
+    name: str,
+    enrollment: Enrollment,
+    descriptors: tuple[str, ...],
+    found: ReadImages,
 ) -> None:
     """Describe the views whose images can be used, and reject those that cannot be described with the others."""
-    pixels = describing.reader(lambda image: decode(reading.content(image)), held)
     tables = [session.empty_table for session in enrollment.sessions]
     while found.rejected.keys().isdisjoint(tables):
         good = Enrollment(key=enrollment.key, object_id=0, started_utc=enrollment.started_utc, planned_azimuth_deg=())
@@ -161,7 +181,7 @@ def _describe(
         if not good.views:
             return
         try:
-            found.contents[name] = describing.computed(pixels, good, name, reading.descriptors)
+            found.contents[name] = describing.computed(pixels, good, name, descriptors)
             return
         except CatalogError as error:
             if "view" not in error.evidence:

@@ -146,7 +146,7 @@ def waiting(place: CatalogPlace, clock: Clock) -> int:
         journal.database.read() as transaction,
     ):
         answers = transaction.scalar(select(func.count()).where(_is_waiting(transaction)))
-        return len(state.used(transaction)) + (answers or 0)
+        return len(state.State(transaction).used()) + (answers or 0)
 
 
 def discard(journal: Catalog, name: str) -> None:
@@ -252,9 +252,10 @@ def _replaces(journal: Catalog, enrollment: Enrollment) -> bool:
 def _forget(journal: Catalog, name: str, key: str) -> None:
     """Remove a delivered object from the journal, unless it has been or is being enrolled again."""
     with journal.database.write() as transaction:
-        known = state.find(transaction, name)
-        complete = state.of_status(transaction, known, EnrollmentStatus.COMPLETE)
-        again = state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS) is not None
+        found = state.State(transaction)
+        known = found.find(name)
+        complete = found.of_status(known, EnrollmentStatus.COMPLETE)
+        again = found.of_status(known, EnrollmentStatus.IN_PROGRESS) is not None
         if not again and complete is not None and complete.enrollment.key == key:
             log.append(transaction, journal.clock, Action.DELETED, name, **state.columns(known, deleted=True))
 

@@ -18,12 +18,13 @@ from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, and_, func, or_, select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import digests, log, state
+from rig.catalog import digests, log
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged, image_name
 from rig.catalog.facts import Action, Entry
 from rig.catalog.images import path_of
 from rig.catalog.records import JsonObject, Provenance, RecordedOutcome, as_json
+from rig.catalog.state import State
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
@@ -276,7 +277,7 @@ def correct(
     with catalog.database.write() as transaction:
         now = before = _find(transaction, result_id).current
         if object_name is not None:
-            right = state.find(transaction, object_name).object_name
+            right = State(transaction).find(object_name).object_name
             now = now._replace(outcome=RecordedOutcome.FOUND, object_name=right)
         if unknown:
             now = now._replace(outcome=RecordedOutcome.UNKNOWN, object_name=None)

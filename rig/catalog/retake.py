@@ -15,12 +15,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.catalog import log, state
+from rig.catalog import log
 from rig.catalog.catalog import Catalog, store_image
 from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Session, View
 from rig.catalog.records import EnrollmentStatus, Provenance
-from rig.catalog.state import EnrollmentState
+from rig.catalog.state import EnrollmentState, State, ending
 from rig.catalog.transfer import add_rows, digest, same_session, same_view
 from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
@@ -115,8 +115,9 @@ class Retake:
         digest(new, secrets.token_hex(32))
         described(database, new, self.object_name, held=self._held)
         with database.write() as transaction:
-            known = state.by_id(transaction, former.object_id)
-            current = state.of_status(transaction, known, EnrollmentStatus.COMPLETE)
+            before = State(transaction)
+            known = before.by_id(former.object_id)
+            current = before.of_status(known, EnrollmentStatus.COMPLETE)
             if known.deleted or current is None or current.enrollment.key != former.key:
                 raise CatalogError(
                     f"{self.object_name!r} was enrolled again or deleted while its views were taken.",
@@ -126,7 +127,7 @@ class Retake:
                 if database.images.size(view.image) != len(png):  # `collect_garbage` removed it
                     database.images.put(png)
             add_rows(transaction, new, former.object_id)
-            state.end_current(transaction, clock, known, EnrollmentStatus.COMPLETE)
-            columns = state.ending(EnrollmentState(new, EnrollmentStatus.COMPLETE, clock.utc()))
+            before.end_current(clock, known, EnrollmentStatus.COMPLETE)
+            columns = ending(EnrollmentState(new, EnrollmentStatus.COMPLETE, clock.utc()))
             columns["details"] |= {"taken_again": list(self.indices)}
             log.append(transaction, clock, Action.ENROLLED, known.object_name, **columns)

@@ -25,7 +25,7 @@ def empty_tables(catalog: Catalog) -> EmptyTables:
     newest: tuple[int, int] | None = None
     with_image: dict[str, bool] = {}
     with catalog.database.read() as transaction:
-        owner = {one.enrollment_id: one.name for one in state.used(transaction)}
+        owner = {one.enrollment_id: one.name for one in state.State(transaction).used()}
         rows = transaction.execute(
             select(Session.enrollment_id, Session.number, Session.empty_table).order_by(Session.started_utc)
         )
@@ -41,7 +41,9 @@ def empty_tables(catalog: Catalog) -> EmptyTables:
 def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
     """Return the camera's settings (`rig.devices.camera.CameraLocks`) of the objects in use, each combination once."""
     with catalog.database.read() as transaction:
-        shown = _settings((view.id, view.evidence) for view in state.first_views(transaction, View.id, View.evidence))
+        shown = _settings(
+            (view.id, view.evidence) for view in state.State(transaction).first_views(View.id, View.evidence)
+        )
         for view_id, _ in shown:
             state.view(transaction, view_id)  # of an edited one nothing is used
     return [settings for _, settings in shown]

@@ -1,4 +1,4 @@
-"""The state of a catalog, which follows from its log: the objects in use, their names, and their enrollments.
+"""The state of a catalog, a fold over its log: the objects in use, their names, and their enrollments.
 
 The last line that gives an object a state counts, and the last line that gives an enrollment a status. No other module
 says which these are.
@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from difflib import get_close_matches
 from hashlib import sha256
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from sqlalchemy import ColumnElement, and_, bindparam, exists, false, func, or_, select, true, union
+from sqlalchemy import ColumnElement, Select, func, or_, select
 from sqlalchemy.orm import Session as Transaction
-from sqlalchemy.orm import aliased, selectinload
+from sqlalchemy.orm import InstrumentedAttribute, selectinload
 
 from rig.catalog import digests, log
 from rig.catalog.columns import damaged
-from rig.catalog.facts import Action, Enrollment, Entry, View, damaged_parts, digest_of, seal_of
+from rig.catalog.facts import Action, Enrollment, Entry, View, digest_of, seal_of
 from rig.catalog.facts import Session as EnrollmentSession
 from rig.catalog.jobs import portions
 from rig.catalog.records import EnrollmentStatus, clean_name, is_plan
@@ -29,47 +29,21 @@ from rig.core.next_steps import Do
 COLLECTED: Final = "enrollments"
 """Key of the record of a line `Action.GARBAGE_COLLECTED`: the ids of the removed enrollments."""
 
-Named = aliased(Entry, name="named")
-"""The line that gives an object its present state."""
-Ended = aliased(Entry, name="ended")
-"""The line that gives an enrollment its present status."""
-_Later = aliased(Entry, name="later")
-
-
-def _is_last(entry: type[Entry], key: str, sets: str) -> ColumnElement[bool]:
-    """Return the condition that no later line of the same object or enrollment sets the column ``sets``, too."""
-    later = exists(1).where(
-        getattr(_Later, key) == getattr(entry, key), getattr(_Later, sets).is_not(None), _Later.id > entry.id
-    )
-    return and_(getattr(entry, sets).is_not(None), ~later)
-
-
 CURRENT: Final = {
     EnrollmentStatus.COMPLETE: (EnrollmentStatus.SUPERSEDED, Action.ENROLLMENT_SUPERSEDED),
     EnrollmentStatus.IN_PROGRESS: (EnrollmentStatus.ABANDONED, Action.ENROLLMENT_ABANDONED),
 }
 """An object has one enrollment of each such status. What becomes of it if it gets another one."""
 
-IS_STATE = _is_last(Named, "object_id", "deleted")
-IS_STATUS = _is_last(Ended, "enrollment_id", "status")
-IN_USE = and_(IS_STATE, Named.deleted == false())
+
+def _last_lines(sets: InstrumentedAttribute[Any], of: InstrumentedAttribute[Any]) -> Select[Any]:
+    """Return the last lines of the log that set this column, of each object or enrollment."""
+    return select(Entry).where(Entry.id.in_(select(func.max(Entry.id)).where(sets.is_not(None)).group_by(of)))
+
+
 # Statements that many others ask for: to build one takes longer than to execute it.
-_BY_ID = select(Named).where(IS_STATE, Named.object_id == bindparam("object_id"))
-_FOLD = select(Named.id).where(IS_STATE), select(Ended.id).where(IS_STATUS)
-_USED = (
-    select(Named.object_id, Named.object_name, Ended.enrollment_id, Ended.seal, Enrollment.id)
-    .join(Ended, Ended.object_id == Named.object_id)
-    .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
-    .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
-    .order_by(Named.object_id)
-)
-_OWNED = (
-    select(Enrollment.id, Ended.seal, Enrollment.object_id, Ended.object_id, Named.object_name)
-    .select_from(Enrollment)
-    .outerjoin(Ended, and_(Ended.enrollment_id == Enrollment.id, IS_STATUS))
-    .outerjoin(Named, and_(Named.object_id == Enrollment.object_id, IS_STATE))
-    .order_by(Enrollment.id)
-)
+_STATES: Final = _last_lines(Entry.deleted, Entry.object_id).order_by(Entry.object_id)
+_STATUSES: Final = _last_lines(Entry.status, Entry.enrollment_id)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,50 +88,275 @@ class ObjectDetails:
         return () if self.complete is None else self.complete.views
 
 
-@dataclass(frozen=True, slots=True)
-class Used:
+class Used(NamedTuple):
     """A complete enrollment of an object in use: what searches compare with."""
 
-    object_id: int
     name: str
+    object_id: int
     enrollment_id: int
     seal: str
 
 
-def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
-    """Return the enrollments that searches use, in the order in which their objects were added.
+class State:
+    """The state of a catalog as a transaction sees it.
 
-    Raises `CatalogDamaged`: they are ``checked``, and the name or the seal of an object is not as it was written.
+    ``objects`` are the lines of the log that give each object its present state, by its id, in the order in which the
+    objects were added. ``statuses`` are the lines that give each enrollment its present status, by its id. The lines
+    are as they are stored: a method compares those that it uses with their digests, unless it says otherwise.
     """
-    rows = transaction.execute(_USED).all()
-    if checked:
-        check_fold(transaction)
-    owners = Counter(row[0] for row in rows)
-    # An enrollment is missing, or no program wrote this.
-    if wrong := [str(row[1]) for row in rows if None in row or owners[row[0]] > 1]:
-        raise changed(wrong)
-    found: Sequence[Sequence[Any]] = rows
-    return [Used(*row[:4]) for row in found]
 
+    def __init__(self, transaction: Transaction) -> None:
+        self._transaction = transaction
+        self.objects: dict[int | None, Entry] = {line.object_id: line for line in transaction.scalars(_STATES)}
+        self.statuses: dict[int | None, Entry] = {line.enrollment_id: line for line in transaction.scalars(_STATUSES)}
 
-def first_views(transaction: Transaction, *columns: Any) -> list[Any]:
-    """Return these columns of the first view of each enrollment that searches use."""
-    ids = sorted(one.enrollment_id for one in used(transaction))
-    wanted = select(*columns).where(View.index == 0).order_by(View.enrollment_id)
-    return [
-        row for part in portions(ids, 500) for row in transaction.execute(wanted.where(View.enrollment_id.in_(part)))
-    ]
+    def check(self) -> None:
+        """Raise `CatalogDamaged` if a line of the state is missing or not as it was written."""
+        log.check_complete(self._transaction)
+        check_lines(self._transaction, {line.id for line in (*self.objects.values(), *self.statuses.values())})
 
+    def in_use(self) -> list[Entry]:
+        """Return the states of the objects in use, unchecked."""
+        return [line for line in self.objects.values() if not line.deleted]
 
-def version(transaction: Transaction) -> str:
-    """Return a digest of what searches compare with: the names of the objects and the seals of their enrollments."""
-    return sha256(ascii([(one.name, one.seal) for one in used(transaction)]).encode()).hexdigest()
+    def deleted(self) -> list[Entry]:
+        """Return the states of the deleted objects that `collect_garbage` has not removed, unchecked."""
+        stored = set(self._transaction.scalars(select(Enrollment.object_id)))
+        return [line for line in self.objects.values() if line.deleted and line.object_id in stored]
 
+    # Objects
 
-def check_fold(transaction: Transaction) -> None:
-    """Raise `CatalogDamaged` if a line that gives a present state or status is missing or not as it was written."""
-    log.check_complete(transaction)
-    check_lines(transaction, {line for lines in _FOLD for line in transaction.scalars(lines)})
+    def find(self, name: str, *, deleted: bool = False) -> Entry:
+        """Return the state of an object in use, or of the last ``deleted`` one that is still stored.
+
+        Raises `ObjectNotFound`: there is no such object. The next step lists similar names.
+        """
+        name = clean_name(name)
+        among = self.deleted() if deleted else self.in_use()
+        if (found := self._named(name, among)) is not None:
+            return found
+        self.check()  # its name or its state may have been changed
+        by_folded = {str(line.object_name).casefold(): str(line.object_name) for line in among}
+        near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
+        kind = "deleted object" if deleted else "object"
+        raise ObjectNotFound(
+            f"There is no {kind} {name!r} in the catalog.",
+            next_step=f"Did you mean {' or '.join(map(repr, near))}?" if near else Do.LIST_OBJECTS(deleted=deleted),
+            evidence={"near": near},
+        )
+
+    def named(self, name: str) -> Entry | None:
+        """Return the state of the object in use with this name, which is clean; None if there is none."""
+        return self._named(name, self.in_use())
+
+    def _named(self, name: str, among: Sequence[Entry]) -> Entry | None:
+        found = [line for line in among if line.object_name == name]
+        last = max(found, key=lambda line: line.id, default=None)
+        return last and self._checked(last)
+
+    def by_id(self, object_id: int | None) -> Entry:
+        """Return the state of an object, in use or deleted."""
+        if (found := self.objects.get(object_id)) is None:
+            raise damaged("the owner of an enrollment", object_id)
+        return self._checked(found)
+
+    def _checked(self, line: Entry) -> Entry:
+        check_lines(self._transaction, [line.id])
+        return line
+
+    def check_free(self, name: str) -> None:
+        """Raise `ObjectExists` if an object in use has this name."""
+        if self.named(name) is not None:
+            raise ObjectExists(
+                f"There is another object {name!r} in the catalog.",
+                next_step=("Choose another name, or", Do.RENAME(name=name)),
+            )
+
+    def summaries(self, states: Sequence[Entry]) -> list[ObjectSummary]:
+        """Return summaries of the objects with these states. All lines are checked."""
+        self.check()
+        # Two statements for all objects together, and not one for each object.
+        counts = select(View.enrollment_id, func.count()).group_by(View.enrollment_id)
+        lengths = select(Enrollment.id, func.json_array_length(Enrollment.planned_azimuth_deg))
+        taken: dict[int | None, int] = dict(self._transaction.execute(counts).all())
+        planned: dict[int | None, int] = dict(self._transaction.execute(lengths).all())
+        current = {(line.object_id, line.status): line for line in self.statuses.values()}
+        found = []
+        for one in states:
+            done = current.get((one.object_id, EnrollmentStatus.COMPLETE))
+            begun = current.get((one.object_id, EnrollmentStatus.IN_PROGRESS))
+            views = taken.get(done.enrollment_id, 0) if done is not None else 0
+            # A complete enrollment whose views are gone was changed from outside.
+            if done is not None and views != planned.get(done.enrollment_id):
+                raise changed([str(one.object_name)])
+            is_unfinished = begun is not None and begun.enrollment_id in planned  # or it was discarded
+            found.append(
+                ObjectSummary(
+                    name=str(one.object_name),
+                    label=one.label or "",
+                    note=one.note or "",
+                    created_utc=one.created_utc or one.time_utc,
+                    enrolled_utc=None if done is None else done.finished_utc,
+                    views=views,
+                    unfinished_views=taken.get(begun.enrollment_id, 0) if begun and is_unfinished else None,
+                    deleted_utc=one.time_utc if one.deleted else None,
+                )
+            )
+        return found
+
+    # Enrollments
+
+    def used(self, *, checked: bool = False) -> list[Used]:
+        """Return the enrollments that searches use, in the order in which their objects were added.
+
+        Raises `CatalogDamaged`: they are ``checked``, and the name or the seal of an object is not as it was written.
+        """
+        if checked:
+            self.check()
+        present = set(self._transaction.scalars(select(Enrollment.id)))
+        names = {line.object_id: line.object_name for line in self.in_use()}
+        rows = [
+            (names[line.object_id], line.object_id, line.enrollment_id, line.seal)
+            for line in self.statuses.values()
+            if line.status is EnrollmentStatus.COMPLETE and line.object_id in names
+        ]
+        owners = Counter(row[1] for row in rows)
+        # An enrollment is missing, or no program wrote this.
+        if wrong := [str(row[0]) for row in rows if None in row or row[2] not in present or owners[row[1]] > 1]:
+            raise changed(wrong)
+        found: list[Any] = rows
+        return sorted((Used(*row) for row in found), key=lambda one: one.object_id)
+
+    def version(self) -> str:
+        """Return a digest of what searches compare with: the names of objects and the seals of their enrollments."""
+        return sha256(ascii([(one.name, one.seal) for one in self.used()]).encode()).hexdigest()
+
+    def first_views(self, *columns: Any) -> list[Any]:
+        """Return these columns of the first view of each enrollment that searches use."""
+        ids = sorted(one.enrollment_id for one in self.used())
+        wanted = select(*columns).where(View.index == 0).order_by(View.enrollment_id)
+        return [
+            row
+            for part in portions(ids, 500)
+            for row in self._transaction.execute(wanted.where(View.enrollment_id.in_(part)))
+        ]
+
+    def enrollments(self, condition: ColumnElement[bool]) -> list[EnrollmentState]:
+        """Return enrollments with their sessions and views, newest first, all as they were written."""
+        wanted = (
+            select(Enrollment)
+            .where(condition)
+            .options(selectinload(Enrollment.sessions), selectinload(Enrollment.views))
+            .order_by(Enrollment.id.desc())
+            .execution_options(populate_existing=True)
+        )
+        rows = self._transaction.scalars(wanted).all()
+        endings = [self.statuses.get(one.id) for one in rows]
+        check_lines(self._transaction, [line.id for line in endings if line is not None])
+        wrong = self.damaged_enrollments([one.id for one in rows]) if rows else {}
+        found = []
+        for enrollment, ended in zip(rows, endings, strict=True):
+            if ended is None or ended.status is None or enrollment.id in wrong or not is_possible(enrollment, ended):
+                raise changed([str(self.by_id(enrollment.object_id).object_name)])
+            found.append(EnrollmentState(enrollment, ended.status, ended.finished_utc, ended.seal))
+        self._transaction.expunge_all()
+        return found
+
+    def enrollments_of(self, object_id: int | None) -> list[EnrollmentState]:
+        """Return the enrollments of an object: by their own rows, and by the log."""
+        return self.enrollments(or_(Enrollment.object_id == object_id, Enrollment.id.in_(self._logged(object_id))))
+
+    def of_status(self, known: Entry, status: EnrollmentStatus) -> EnrollmentState | None:
+        """Return the enrollment of an object that is complete or in progress; None if there is none."""
+        own = {number for number in self._logged(known.object_id) if self.statuses[number].status is status}
+        return next(iter(self.enrollments(Enrollment.id.in_(own))), None) if own else None
+
+    def _logged(self, object_id: int | None) -> list[int | None]:
+        return [number for number, line in self.statuses.items() if line.object_id == object_id]
+
+    def unfinished(self, known: Entry) -> EnrollmentState:
+        """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
+        found = self.of_status(known, EnrollmentStatus.IN_PROGRESS)
+        if found is None:
+            raise CatalogError(
+                f"{known.object_name!r} has no unfinished enrollment.", next_step=Do.ENROLL(name=str(known.object_name))
+            )
+        return found
+
+    def check_not_enrolled(self, known: Entry) -> None:
+        """Raise an error if an object is enrolled, or its enrollment has begun."""
+        name = str(known.object_name)
+        if (begun := self.of_status(known, EnrollmentStatus.IN_PROGRESS)) is not None:
+            raise CatalogError(
+                f"The enrollment of {name!r} is unfinished, with {len(begun.enrollment.views)} of "
+                f"{len(begun.enrollment.planned_azimuth_deg)} views.",
+                next_step=(Do.CONTINUE_ENROLLMENT(name=name), "Or", Do.ENROLL_AGAIN(name=name)),
+            )
+        if (done := self.of_status(known, EnrollmentStatus.COMPLETE)) is not None:
+            raise ObjectExists(
+                f"{name!r} is enrolled already, with {len(done.enrollment.views)} views.",
+                next_step=(
+                    "Choose another name, or",
+                    Do.ENROLL_AGAIN(name=name),
+                    "The old views stay in use until the new ones are complete.",
+                ),
+            )
+
+    def end_current(self, clock: Clock, known: Entry, status: EnrollmentStatus) -> None:
+        """End the enrollment of an object that is complete or in progress, if there is one: another replaces it."""
+        before = self.of_status(known, status)
+        if before is not None:
+            ended, action = CURRENT[status]
+            one = replace(before, status=ended, finished_utc=before.finished_utc or clock.utc())
+            log.append(self._transaction, clock, action, known.object_name, **ending(one))
+
+    # Damage
+
+    def damaged_enrollments(self, ids: Collection[int] | None = None) -> dict[int, str | None]:
+        """Return which enrollments, of these or of all, are not as they were written, with the names of their objects.
+
+        Lines of the log are not checked.
+        """
+        owners = select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.id)
+        rows = dict(self._transaction.execute(owners if ids is None else owners.where(Enrollment.id.in_(ids))).all())
+        endings = {number: self.statuses.get(number) for number in rows}
+        seals = {number: None if line is None else line.seal for number, line in endings.items()}
+        wrong = set(digests.damaged_enrollments(self._transaction, seals))
+        wrong |= {number for number, line in endings.items() if line is None or line.object_id != rows[number]}
+        names = {number: line.object_name for number, line in self.objects.items()}
+        return {number: names.get(owner) for number, owner in rows.items() if number in wrong}
+
+    def missing_enrollments(self, object_id: int | None = None) -> dict[int, str | None]:
+        """Return the enrollments, of one object or of all, that are in the log only, but that no program removed.
+
+        By their ids, with the names of their objects. Lines of the log are not checked.
+        """
+        names = {
+            number: line.object_name
+            for number, line in self.statuses.items()
+            if number is not None and object_id in (None, line.object_id)
+        }
+        present = set(self._transaction.scalars(select(Enrollment.id)))
+        if names.keys() <= present:
+            return {}
+        removals = select(Entry).where(Entry.action.in_((Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)))
+        for line in self._transaction.scalars(removals):
+            collected = (line.record or {}).get(COLLECTED)
+            present |= {one for one in collected if isinstance(one, int)} if isinstance(collected, list) else set()
+            present |= {line.enrollment_id or 0}
+        return {number: names[number] for number in sorted(names.keys() - present)}
+
+    def check_present(self, object_id: int | None) -> None:
+        """Raise `CatalogDamaged` if an enrollment of an object is missing."""
+        if names := self.missing_enrollments(object_id).values():
+            raise changed([str(name) for name in dict.fromkeys(names)])
+
+    def check_everything(self) -> None:
+        """Raise `CatalogDamaged` if objects or enrollments are not as they were written."""
+        self.check()
+        if wrong := self.damaged_enrollments():
+            raise changed([str(name) for name in wrong.values()])
+        self.used()
 
 
 def check_lines(transaction: Transaction, ids: Collection[int]) -> None:
@@ -177,52 +376,7 @@ def changed(names: Sequence[str]) -> CatalogDamaged:
     )
 
 
-def find(transaction: Transaction, name: str, *, deleted: bool = False) -> Entry:
-    """Return the state of an object in use, or of the last ``deleted`` one that is still stored.
-
-    Raises `ObjectNotFound`: there is no such object. The next step lists similar names.
-    """
-    name = clean_name(name)
-    among = _among(deleted)
-    found = transaction.scalar(
-        select(Named).where(Named.object_name == name, *among).order_by(Named.id.desc()).limit(1)
-    )
-    if found is not None:
-        check_lines(transaction, [found.id])
-        return found
-    check_fold(transaction)  # its name or its state may have been changed
-    by_folded = {str(known).casefold(): known for known in transaction.scalars(select(Named.object_name).where(*among))}
-    near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
-    state = "deleted object" if deleted else "object"
-    raise ObjectNotFound(
-        f"There is no {state} {name!r} in the catalog.",
-        next_step=f"Did you mean {' or '.join(map(repr, near))}?" if near else Do.LIST_OBJECTS(deleted=deleted),
-        evidence={"near": near},
-    )
-
-
-def _among(deleted: bool) -> list[ColumnElement[bool]]:
-    """Return the conditions for the objects in use; or for the deleted ones that `collect_garbage` has not removed."""
-    if not deleted:
-        return [IN_USE]
-    return [IS_STATE, Named.deleted == true(), exists(1).where(Enrollment.object_id == Named.object_id)]
-
-
-def state_of(transaction: Transaction, name: str) -> Entry | None:
-    """Return the state of the object in use with this name, which is clean; None if there is none."""
-    found = transaction.scalar(select(Named).where(Named.object_name == name, IN_USE))
-    if found is not None:
-        check_lines(transaction, [found.id])
-    return found
-
-
-def by_id(transaction: Transaction, object_id: int | None) -> Entry:
-    """Return the state of an object, in use or deleted."""
-    found = transaction.scalar(_BY_ID, {"object_id": object_id})
-    if found is None:
-        raise damaged("the owner of an enrollment", object_id)
-    check_lines(transaction, [found.id])
-    return found
+# Lines of the log
 
 
 def new_columns(created_utc: datetime, texts: Mapping[str, str]) -> dict[str, Any]:
@@ -236,120 +390,20 @@ def columns(known: Entry, texts: Mapping[str, str] | None = None, *, deleted: bo
     return {**own, "object_id": known.object_id, "deleted": deleted, **(texts or {})}
 
 
-def check_free(transaction: Transaction, name: str) -> None:
-    """Raise `ObjectExists` if an object in use has this name."""
-    if state_of(transaction, name) is not None:
-        raise ObjectExists(
-            f"There is another object {name!r} in the catalog.",
-            next_step=("Choose another name, or", Do.RENAME(name=name)),
-        )
+def ending(one: EnrollmentState) -> dict[str, Any]:
+    """Return the columns of a line of the log that gives an enrollment its status."""
+    enrollment, has_ended = one.enrollment, one.status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED)
+    return {
+        "object_id": enrollment.object_id,
+        "enrollment_id": enrollment.id,
+        "status": one.status,
+        "finished_utc": one.finished_utc,
+        "seal": seal_of(enrollment) if has_ended else None,
+        "details": {"enrollment_id": enrollment.id, "views": len(enrollment.views)},
+    }
 
 
-def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int | None = None) -> list[ObjectSummary]:
-    """Return the objects in use or the deleted ones, or one object, in the order in which they were added."""
-    conditions = _among(deleted) if object_id is None else [IS_STATE, Named.object_id == object_id]
-    count = select(func.count()).where(View.enrollment_id == Ended.enrollment_id).correlate(Ended).scalar_subquery()
-    columns = (
-        *(Named.id, Named.object_id, Named.object_name, Named.label, Named.note),
-        *(Named.created_utc, Named.time_utc, Named.deleted),
-    )
-    states = transaction.execute(select(*columns).where(*conditions).order_by(Named.object_id)).all()
-    # Two statements for all objects together, and not one for each object.
-    planned = func.json_array_length(Enrollment.planned_azimuth_deg)
-    wanted = (
-        select(Ended.object_id, Ended.status, Ended.finished_utc, count, planned, Ended.id)
-        .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
-        .where(
-            or_(Enrollment.id.is_not(None), Ended.status == EnrollmentStatus.COMPLETE),  # or it was discarded
-            IS_STATUS,
-            Ended.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]),
-        )
-    )
-    if object_id is not None:
-        wanted = wanted.where(Ended.object_id == object_id)
-    current = {(row[0], row[1]): row[2:] for row in transaction.execute(wanted)}
-    if object_id is None:
-        check_fold(transaction)
-    else:
-        log.check_complete(transaction)
-        check_lines(transaction, {one.id for one in states} | {row[3] for row in current.values()})
-    found = []
-    for one in states:
-        enrolled_utc, views, planned_views, _ = current.get((one.object_id, EnrollmentStatus.COMPLETE), (None, 0, 0, 0))
-        _, unfinished, _, _ = current.get((one.object_id, EnrollmentStatus.IN_PROGRESS), (None, None, None, None))
-        # A complete enrollment whose views are gone was changed from outside.
-        if views != planned_views:
-            raise changed([str(one.object_name)])
-        found.append(
-            ObjectSummary(
-                name=str(one.object_name),
-                label=one.label or "",
-                note=one.note or "",
-                created_utc=one.created_utc or one.time_utc,
-                enrolled_utc=enrolled_utc,
-                views=views,
-                unfinished_views=unfinished,
-                deleted_utc=one.time_utc if one.deleted else None,
-            )
-        )
-    return found
-
-
-def of_object(object_id: int | None) -> ColumnElement[bool]:
-    """Return the condition for the enrollments of an object: by their own rows, and by the log."""
-    own = select(Enrollment.id).where(Enrollment.object_id == object_id)
-    logged = select(_Later.enrollment_id).where(_Later.object_id == object_id, _Later.status.is_not(None))
-    return Ended.enrollment_id.in_(union(own, logged))
-
-
-def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> list[EnrollmentState]:
-    """Return enrollments with their sessions and views, newest first, all as they were written."""
-    wanted = (
-        select(Enrollment, Ended)
-        .join(Ended, Ended.enrollment_id == Enrollment.id)
-        .where(IS_STATUS, *conditions)
-        .options(selectinload(Enrollment.sessions), selectinload(Enrollment.views))
-        .order_by(Enrollment.id.desc())
-        .execution_options(populate_existing=True)
-    )
-    rows = transaction.execute(wanted).all()
-    check_lines(transaction, [ended.id for _, ended in rows])
-    for enrollment, ended in rows:
-        if damaged_parts(enrollment, ended.seal) or not is_possible(enrollment, ended):
-            raise changed([str(by_id(transaction, enrollment.object_id).object_name)])
-    transaction.expunge_all()
-    return [
-        EnrollmentState(one, ended.status, ended.finished_utc, ended.seal)
-        for one, ended in rows
-        if ended.status is not None
-    ]
-
-
-def missing_enrollments(transaction: Transaction, object_id: int | None = None) -> dict[int, str | None]:
-    """Return the enrollments, of one object or of all, that are in the log only, although this program removed none.
-
-    By their ids, with the names of their objects.
-    """
-    lines = select(Entry.enrollment_id, Entry.object_name).where(Entry.status.is_not(None))
-    if object_id is not None:
-        lines = lines.where(Entry.object_id == object_id)
-    names = {number: name for number, name in transaction.execute(lines) if number is not None}
-    ids = select(Enrollment.id)
-    present = set(transaction.scalars(ids if object_id is None else ids.where(Enrollment.object_id == object_id)))
-    if names.keys() <= present:
-        return {}
-    removals = select(Entry).where(Entry.action.in_((Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)))
-    for line in transaction.scalars(removals):
-        collected = (line.record or {}).get(COLLECTED)
-        present |= {one for one in collected if isinstance(one, int)} if isinstance(collected, list) else set()
-        present |= {line.enrollment_id or 0}
-    return {number: names[number] for number in sorted(names.keys() - present)}
-
-
-def check_present(transaction: Transaction, object_id: int | None = None) -> None:
-    """Raise `CatalogDamaged` if an enrollment, of one object or of any, is missing."""
-    if names := missing_enrollments(transaction, object_id).values():
-        raise changed([str(name) for name in dict.fromkeys(names)])
+# Rows
 
 
 def is_possible(enrollment: Enrollment, ended: Entry) -> bool:
@@ -395,75 +449,3 @@ def _check_part(transaction: Transaction, part: View | EnrollmentSession, name: 
     key = transaction.scalar(select(Enrollment.key).where(Enrollment.id == part.enrollment_id))
     if part.digest != digest_of(part, str(key)):
         raise changed([name])
-
-
-def unfinished(transaction: Transaction, state: Entry) -> EnrollmentState:
-    """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
-    found = of_status(transaction, state, EnrollmentStatus.IN_PROGRESS)
-    if found is None:
-        raise CatalogError(
-            f"{state.object_name!r} has no unfinished enrollment.", next_step=Do.ENROLL(name=str(state.object_name))
-        )
-    return found
-
-
-def of_status(transaction: Transaction, state: Entry, status: EnrollmentStatus) -> EnrollmentState | None:
-    """Return the enrollment of an object that is complete or in progress; None if there is none."""
-    return next(iter(enrollments(transaction, of_object(state.object_id), Ended.status == status)), None)
-
-
-def ending(one: EnrollmentState) -> dict[str, Any]:
-    """Return the columns of a line of the log that gives an enrollment its status."""
-    enrollment, has_ended = one.enrollment, one.status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED)
-    return {
-        "object_id": enrollment.object_id,
-        "enrollment_id": enrollment.id,
-        "status": one.status,
-        "finished_utc": one.finished_utc,
-        "seal": seal_of(enrollment) if has_ended else None,
-        "details": {"enrollment_id": enrollment.id, "views": len(enrollment.views)},
-    }
-
-
-def end_current(transaction: Transaction, clock: Clock, known: Entry, status: EnrollmentStatus) -> None:
-    """End the enrollment of an object that is complete or in progress, if there is one: another one replaces it."""
-    before = of_status(transaction, known, status)
-    if before is not None:
-        ended, action = CURRENT[status]
-        one = replace(before, status=ended, finished_utc=before.finished_utc or clock.utc())
-        log.append(transaction, clock, action, known.object_name, **ending(one))
-
-
-def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
-    """Raise an error if an object is enrolled, or its enrollment has begun."""
-    name = str(state.object_name)
-    if (begun := of_status(transaction, state, EnrollmentStatus.IN_PROGRESS)) is not None:
-        raise CatalogError(
-            f"The enrollment of {name!r} is unfinished, with {len(begun.enrollment.views)} of "
-            f"{len(begun.enrollment.planned_azimuth_deg)} views.",
-            next_step=(Do.CONTINUE_ENROLLMENT(name=name), "Or", Do.ENROLL_AGAIN(name=name)),
-        )
-    if (done := of_status(transaction, state, EnrollmentStatus.COMPLETE)) is not None:
-        raise ObjectExists(
-            f"{name!r} is enrolled already, with {len(done.enrollment.views)} views.",
-            next_step=(
-                "Choose another name, or",
-                Do.ENROLL_AGAIN(name=name),
-                "The old views stay in use until the new ones are complete.",
-            ),
-        )
-
-
-def check(transaction: Transaction) -> None:
-    """Raise `CatalogDamaged` if objects or enrollments are not as they were written."""
-    check_fold(transaction)
-    if wrong := damaged_enrollments(transaction):
-        raise changed([str(name) for name in wrong.values()])
-    used(transaction)
-
-
-def damaged_enrollments(transaction: Transaction, ids: Collection[int] | None = None) -> dict[int, str | None]:
-    """Return which enrollments, of these or of all, are not as they were written, with the names of their objects."""
-    rows = transaction.execute(_OWNED if ids is None else _OWNED.where(Enrollment.id.in_(ids))).all()
-    wrong = set(digests.damaged_enrollments(transaction, {number: seal for number, seal, *_ in rows}))
-    return {number: name for number, _, owner, in_log, name in rows if number in wrong or owner != in_log}

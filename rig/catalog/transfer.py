@@ -7,7 +7,7 @@ Decision: docs/decisions/0011.
 """
 
 import secrets
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
@@ -16,14 +16,15 @@ from typing import Any, Final, Protocol
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import describing, digests, log, state
+from rig.catalog import describing, digests, log
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, digest_of, digested, seal_of, sha256_of
-from rig.catalog.incoming import OTHER_IMAGE, ImportProblem, ReadImages, Reading, RejectedFile, read_images
+from rig.catalog.incoming import Read, ReadImages, RejectedFile, checked, images_of, read_images, store_images
 from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
-from rig.catalog.state import EnrollmentState, Named
+from rig.catalog.state import EnrollmentState, State, ending, new_columns
+from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 
@@ -64,8 +65,8 @@ class TransferSource(Protocol):
         """What cannot be transferred."""
 
     @property
-    def content(self) -> Callable[[str], bytes]:
-        """Function that returns the bytes of an image, unchecked. It can be sent to other processes."""
+    def content(self) -> Read:
+        """Function that reads an image."""
 
     def items(self) -> Iterator[TransferItem]:
         """Yield the objects."""
@@ -85,7 +86,7 @@ class CatalogSource:
         self.names = names
         self.own = own
         self.origin = str(catalog.place)
-        self.content: Callable[[str], bytes] = catalog.database.images.read
+        self.content: Read = catalog.database.images.read
 
     def items(self) -> Iterator[TransferItem]:
         """Yield the objects in the order in which they were added.
@@ -93,20 +94,21 @@ class CatalogSource:
         Raises `ObjectNotFound`: there is no object of one of the names. `CatalogError`: its enrollment is unfinished.
         """
         with self.catalog.database.read() as transaction:
-            used = state.used(transaction, checked=True)
+            state = State(transaction)
+            used = state.used(checked=True)
             if self.names:
-                named = [state.find(transaction, name) for name in dict.fromkeys(self.names)]
+                named = {known.object_id: known for known in map(state.find, dict.fromkeys(self.names))}
                 enrolled = {one.object_id for one in used}
-                for known in named:
-                    if known.object_id not in enrolled:
-                        raise _not_enrolled(transaction, known)
-                used = [one for one in used if one.object_id in {known.object_id for known in named}]
+                for object_id, known in named.items():
+                    if object_id not in enrolled:
+                        raise _not_enrolled(state, known)
+                used = [one for one in used if one.object_id in named]
             names: set[str] = set()
             for one in used:
-                known = state.by_id(transaction, one.object_id)
-                (found,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
+                known = state.objects[one.object_id]
+                (found,) = state.enrollments(Enrollment.id == one.enrollment_id)
                 item = TransferItem(
-                    *(str(known.object_name), known.label or "", known.note or "", known.created_utc or known.time_utc),
+                    *(one.name, known.label or "", known.note or "", known.created_utc or known.time_utc),
                     *(found.enrollment, found.finished_utc),
                 )
                 _check(item)
@@ -116,10 +118,10 @@ class CatalogSource:
                 yield item
 
 
-def _not_enrolled(transaction: Transaction, known: Entry) -> CatalogError:
+def _not_enrolled(state: State, known: Entry) -> CatalogError:
     """Return the error for an object without a complete enrollment: it is unfinished, or was abandoned."""
     name = str(known.object_name)
-    if state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS) is not None:
+    if state.of_status(known, EnrollmentStatus.IN_PROGRESS) is not None:
         return CatalogError(f"The enrollment of {name!r} is unfinished.", next_step=Do.CONTINUE_ENROLLMENT(name=name))
     return CatalogError(f"The enrollment of {name!r} was abandoned.", next_step=Do.ENROLL(name=name))
 
@@ -175,48 +177,44 @@ def transfer(
     """
     checked_texts(label, None)
     catalog = source if isinstance(source, CatalogSource) else None
-    is_own = catalog is not None and catalog.own
     strict = catalog is not None
-    store = None if dry_run else target.database.images
 
-    # Check all rows, then all images. Photographs are stored at once, without those that are rejected.
+    # Check all rows, then all images; those of the bench's own catalog are compared with their names when they are
+    # stored.
     plan = _Plan(tuple(source.items()))
     with target.database.read() as transaction:
-        plan = plan.compared(transaction, conflict, once=once)
+        plan = plan.compared(State(transaction), conflict, once=once)
     enrollments = {item.name: item.enrollment for item in plan.wanted}
-    reading = Reading(
-        source.content,
-        store if is_own or not strict else None,
-        is_named=catalog is not None,
-        decodes=not is_own,
-        descriptors=tuple(descriptors),
-    )
-    with target.database.catalog_errors():
-        found = yield from read_images(reading, enrollments, strict=strict and not dry_run, jobs=jobs)
+    if catalog is not None and catalog.own:
+        sizes = {image: size for one in enrollments.values() for image, size in images_of(one)}
+        found = ReadImages({image: (image, size) for image, size in sizes.items()})
+    else:
+        options = {"are_named": strict, "strict": strict and not dry_run}
+        found = yield from read_images(source.content, enrollments, tuple(descriptors), **options, jobs=jobs)
     rejected = (*source.rejected, *found.rejected.values())
-    plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=catalog is None))
+    plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=not strict))
     tables = {session.empty_table for one in enrollments.values() for session in one.sessions}
     if (strict and rejected) or (found.rejected and not plan.wanted) or not tables.isdisjoint(found.rejected):
         raise _rejection(source, rejected)
 
-    # Store the images of a strict transfer, now that all of them are right. Then add all rows.
-    if store is not None:
+    # Store the images, now that all of them are right. Then add all rows.
+    if not dry_run:
+        store = target.database.images
         with target.database.catalog_errors():
-            if reading.store is None:
-                storing = replace(reading, store=store, decodes=False)
-                again = yield from read_images(storing, enrollments, strict=True, jobs=jobs)
-                if again.rejected:  # the source has just been changed
-                    raise _rejection(source, [*again.rejected.values()])
-            store.settle({name for name, _ in found.images.values()})
+            if lost := (yield from store_images(source.content, store, found.images)):
+                raise _rejection(source, lost)
         with target.database.write() as transaction:
-            plan = plan.compared(transaction, conflict, once=once)  # another process may have added objects
+            state = State(transaction)
+            plan = plan.compared(state, conflict, once=once)  # another process may have added objects
             missing = store.missing({name for name, _ in found.images.values()})
             for image, (name, _) in found.images.items():
-                # `collect_garbage` removed it: an object that was deleted had it, too
-                if name in missing and store.put(source.content(image)) != name:
-                    raise _rejection(source, [RejectedFile(image, ImportProblem.OTHER_IMAGE, OTHER_IMAGE)])
+                if name in missing:  # `collect_garbage` removed it: an object that was deleted had it, too
+                    content = checked(source.content, image, name)
+                    if isinstance(content, RejectedFile):
+                        raise _rejection(source, [content])
+                    store.put(content)
             if plan.wanted:
-                new = _add(transaction, target, plan, label)
+                new = _add(transaction, state, target.clock, plan, label)
                 details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
                 log.append(
                     transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)}
@@ -308,12 +306,13 @@ def digest(enrollment: Enrollment, key: str) -> None:
 class _Plan:
     """The objects to add, and the names of those that are left out and that get new enrollments.
 
-    ``known`` are enrollments of the target by their keys.
+    ``named`` are the states of objects of the target by their names, ``known`` its enrollments by their keys.
     """
 
     wanted: tuple[TransferItem, ...]
     skipped: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
+    named: Mapping[str, Entry] = field(default_factory=dict)
     known: Mapping[str, EnrollmentState] = field(default_factory=dict)
 
     @property
@@ -327,32 +326,29 @@ class _Plan:
     @property
     def bytes(self) -> int:
         """Sizes of all images, each once."""
-        enrollments = [item.enrollment for item in self.wanted]
-        sizes: dict[str | None, int] = {view.image: view.image_bytes for one in enrollments for view in one.views}
-        sizes |= {part.empty_table: part.empty_table_bytes or 0 for one in enrollments for part in one.sessions}
-        return sum(sizes.values())
+        return sum({image: size for item in self.wanted for image, size in images_of(item.enrollment)}.values())
 
-    def compared(self, transaction: Transaction, conflict: Conflict, *, once: bool) -> "_Plan":
+    def compared(self, state: State, conflict: Conflict, *, once: bool) -> "_Plan":
         """Return the plan after a comparison with the target. `ObjectExists` if a conflict is rejected."""
         known = {
             one.enrollment.key: one
             for part in portions([item.enrollment.key for item in self.wanted], digests.AT_ONCE)
-            for one in state.enrollments(transaction, Enrollment.key.in_(part))
+            for one in state.enrollments(Enrollment.key.in_(part))
         }
-        ids = _ids(transaction, self.names)
-        used = set(transaction.scalars(select(Named.object_id).where(state.IN_USE)))
+        named = {name: line for name in self.names if (line := state.named(name)) is not None}
+        used = {line.object_id for line in state.in_use()}
 
         def is_there(item: TransferItem) -> bool:
             """Return whether the target has the enrollment, and an object of this name has it in use."""
             there = known.get(item.enrollment.key)
             if there is None or once:
                 return there is not None
-            owner, own = there.enrollment.object_id, ids.get(item.name)
-            is_used = own is None or (owner == own and there.status is EnrollmentStatus.COMPLETE)
+            owner, own = there.enrollment.object_id, named.get(item.name)
+            is_used = own is None or (owner == own.object_id and there.status is EnrollmentStatus.COMPLETE)
             return owner in used and is_used and _are_equal(there.enrollment, item.enrollment)
 
         wanted = [item for item in self.wanted if not is_there(item)]
-        both = [item.name for item in wanted if item.name in ids]
+        both = [item.name for item in wanted if item.name in named]
         if both and conflict is Conflict.REJECT:
             raise ObjectExists(
                 f"{len(both)} of {len(self.wanted)} objects {'is' if len(both) == 1 else 'are'} in the catalog "
@@ -365,31 +361,20 @@ class _Plan:
                 ),
                 evidence={"objects": both[:20]},
             )
-        left = [item for item in wanted if conflict is Conflict.REPLACE or item.name not in ids]
+        left = [item for item in wanted if conflict is Conflict.REPLACE or item.name not in named]
         kept = {item.name for item in left}
         skipped = (*self.skipped, *(item.name for item in self.wanted if item.name not in kept))
-        return _Plan(tuple(left), skipped, tuple(both) if conflict is Conflict.REPLACE else (), known)
-
-
-def _ids(transaction: Transaction, names: Sequence[str]) -> dict[str, int]:
-    found: dict[str, int] = {}
-    for part in portions(names, 500):
-        rows = transaction.execute(
-            select(Named.object_name, Named.object_id, Named.id).where(state.IN_USE, Named.object_name.in_(part))
-        ).all()
-        state.check_lines(transaction, [row.id for row in rows])
-        found.update((row.object_name, row.object_id) for row in rows)
-    return found
+        return _Plan(tuple(left), skipped, tuple(both) if conflict is Conflict.REPLACE else (), named, known)
 
 
 # Add
 
 
-def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
+def _add(transaction: Transaction, state: State, clock: Clock, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
     """Add the rows of objects, and a line of the log for each enrollment; return the new ones by name."""
     new = {}
     for item in plan.wanted:
-        known = state.state_of(transaction, item.name)
+        known = plan.named.get(item.name)
         object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
         assert object_id is not None
         enrollment, there = item.enrollment, plan.known.get(item.enrollment.key)
@@ -400,12 +385,11 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
                 digest(enrollment, secrets.token_hex(32))
             new[item.name] = add_rows(transaction, enrollment, object_id)
         if known is not None:
-            state.end_current(transaction, target.clock, known, EnrollmentStatus.COMPLETE)
-        columns = state.ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
+            state.end_current(clock, known, EnrollmentStatus.COMPLETE)
+        columns = ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
         if known is None:
-            texts = {"label": item.label or label or "", "note": item.note}
-            columns |= state.new_columns(item.created_utc, texts)
-        log.append(transaction, target.clock, Action.IMPORTED, item.name, **columns)
+            columns |= new_columns(item.created_utc, {"label": item.label or label or "", "note": item.note})
+        log.append(transaction, clock, Action.IMPORTED, item.name, **columns)
     return new
 
 

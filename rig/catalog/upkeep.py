@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
-from sqlalchemy import delete, func, null, or_, select, true, union_all
+from sqlalchemy import delete, func, null, select, union_all
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
@@ -15,7 +15,6 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View
 from rig.catalog.jobs import portions
 from rig.catalog.records import EnrollmentStatus
-from rig.catalog.state import Ended, Named
 from rig.core.errors import CatalogBusy
 from rig.core.next_steps import Do
 
@@ -48,22 +47,15 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     ``old`` also removes the superseded and abandoned enrollments of objects in use. ``dry_run`` changes nothing.
     """
     database, store = catalog.database, catalog.database.images
-    unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))
-    rows = (
-        select(Enrollment.id, Enrollment.object_id, Named.object_name, Named.deleted)
-        .join(Ended, Ended.enrollment_id == Enrollment.id)
-        .join(Named, Named.object_id == Enrollment.object_id)
-        .where(state.IS_STATUS, state.IS_STATE, unused)
-    )
     # An object store may need minutes: its files are listed outside of a transaction, so that no bench waits. They are
     # listed before the rows: an image whose row is committed in the meantime is named.
     with database.catalog_errors():
         listed = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)
     with database.read() as transaction:
-        found = transaction.execute(rows.order_by(Enrollment.object_id)).all()
+        unused = _unused(transaction, old=old)
         images = transaction.execute(select(NAMED_IMAGES)).all()
-    ids = {row.id for row in found}
-    deleted = tuple({row.object_id: str(row.object_name) for row in found if row.deleted}.values())
+    ids = unused.keys()
+    deleted = tuple({owner.id: str(owner.object_name) for owner in unused.values() if owner.deleted}.values())
     named = {row.image for row in images if row.enrollment_id not in ids}
     lost = (listed | {row.image for row in images if row.enrollment_id in ids}) - named
     with database.catalog_errors():
@@ -74,7 +66,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     if dry_run or not (ids or sizes):
         return collected
     with database.write() as transaction:
-        if not ids <= {row.id for row in transaction.execute(rows)}:
+        if not ids <= _unused(transaction, old=old).keys():
             raise CatalogBusy(
                 "Another process restored a deleted object meanwhile. Nothing was removed.", next_step=Do.RUN_AGAIN()
             )
@@ -112,6 +104,19 @@ NAMED_IMAGES: Final = union_all(
     ).where(Entry.action == Action.IDENTIFIED),
 ).subquery()
 """Every image that a row names, with its enrollment, view and size. A result may have none."""
+
+
+def _unused(transaction: Transaction, *, old: bool) -> dict[int, Entry]:
+    """Return the states of the objects of enrollments that can be removed, by the ids of the enrollments."""
+    found = state.State(transaction)
+    unused = {}
+    for number, object_id in transaction.execute(
+        select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.object_id)
+    ):
+        owner, ended = found.objects.get(object_id), found.statuses.get(number)
+        if owner and ended and (owner.deleted or (old and ended.status in _OLD)):
+            unused[number] = owner
+    return unused
 
 
 def _remove_rows(transaction: Transaction, ids: Collection[int]) -> None:

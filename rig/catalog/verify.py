@@ -3,31 +3,28 @@
 Decision: docs/decisions/0009.
 """
 
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import and_, func, select
+from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import describing, log, state
+from rig.catalog import describing, log
 from rig.catalog.catalog import Catalog
 from rig.catalog.facts import Derived, Enrollment, Entry, View
 from rig.catalog.images import Images, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.state import Ended, Named
+from rig.catalog.state import State
 from rig.catalog.upkeep import NAMED_IMAGES
 from rig.core.errors import CatalogDamaged
 from rig.core.processes import map_in_processes
 from rig.views import image_files as files
 
-_ENROLLMENTS: Final = 10
-"""Enrollments in a portion: few rows are in memory at once."""
 _IMAGE: Final = NAMED_IMAGES.c
-_OWNS: Final = and_(Named.object_id == Enrollment.object_id, state.IS_STATE)
 
 
 class CatalogProblem(StrEnum):
@@ -100,33 +97,30 @@ class _RequiredImage(NamedTuple):
 
 def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgress, None, CatalogVerification]:
     """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core."""
-    findings, of_images = list[CatalogFinding](), list[CatalogFinding]()
+    findings, of_images, required = list[CatalogFinding](), list[CatalogFinding](), list[_RequiredImage]()
     with catalog.database.read() as transaction:
         objects = transaction.scalar(select(func.count(Enrollment.object_id.distinct()))) or 0
         views = transaction.scalar(select(func.count(View.id))) or 0
         results = transaction.scalar(select(func.max(Entry.result))) or 0
-        images = transaction.scalar(select(func.count(_IMAGE.image))) or 0
         damages = dict.fromkeys(catalog.database.damage(transaction))  # in their order, each once
-        ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
-        checks: list[Callable[[Transaction], Iterator[CatalogFinding]]] = [_lines, _missing]
-        checks += [partial(_enrollments, part) for part in portions(ids, _ENROLLMENTS)]
-        for check in (*checks, _derived):
+        for check in (_lines, _enrollments, _derived):
             try:
                 findings += check(transaction)
             except CatalogDamaged as damage:  # a row that cannot be read
                 damages[damage.what] = None
-    changed = {one.details["enrollment_id"] for one in findings if one.problem is CatalogProblem.ENROLLMENT_CHANGED}
-    yield JobProgress(0, images)
-    done, image_bytes, work = 0, 0, partial(_check_images, catalog.database.images)
-    try:
-        for portion, found in map_in_processes(work, portions(_images(catalog, changed)), processes(jobs, images)):
-            of_images += found
-            image_bytes += sum(image.stored_bytes for image in portion)
-            yield JobProgress(done := done + len(portion), images)
-    except CatalogDamaged as damage:
-        damages[damage.what] = None
+        changed = {one.details["enrollment_id"] for one in findings if one.problem is CatalogProblem.ENROLLMENT_CHANGED}
+        try:
+            required = _images(transaction, changed)
+        except CatalogDamaged as damage:
+            damages[damage.what] = None
+    yield JobProgress(0, len(required))
+    done, work = 0, partial(_check_images, catalog.database.images)
+    for portion, found in map_in_processes(work, portions(required), processes(jobs, len(required))):
+        of_images += found
+        yield JobProgress(done := done + len(portion), len(required))
     damaged = [CatalogFinding(CatalogProblem.DAMAGED_DATABASE, details={"message": message}) for message in damages]
     of_images.sort(key=lambda one: (one.view_id is None, one.view_id or 0, one.path))
+    image_bytes = sum(image.stored_bytes for image in required)
     return CatalogVerification(objects, views, results, image_bytes, (*damaged, *findings, *of_images))
 
 
@@ -139,13 +133,11 @@ def _lines(transaction: Transaction) -> Iterator[CatalogFinding]:
     log.check_complete(transaction)  # its error is one more finding
 
 
-def _missing(transaction: Transaction) -> Iterator[CatalogFinding]:
-    for number, name in state.missing_enrollments(transaction).items():
+def _enrollments(transaction: Transaction) -> Iterator[CatalogFinding]:
+    found = State(transaction)
+    for number, name in found.missing_enrollments().items():
         yield CatalogFinding(CatalogProblem.MISSING_ENROLLMENT, name, details={"enrollment_id": number})
-
-
-def _enrollments(ids: Sequence[int], transaction: Transaction) -> Iterator[CatalogFinding]:
-    for number, name in state.damaged_enrollments(transaction, ids).items():
+    for number, name in found.damaged_enrollments().items():
         yield CatalogFinding(CatalogProblem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number})
 
 
@@ -153,23 +145,25 @@ def _derived(transaction: Transaction) -> Iterator[CatalogFinding]:
     columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.content, Derived.sha256)
     rows = transaction.execute(columns.order_by(Derived.seal, Derived.what).execution_options(yield_per=100))
     wrong = [row[:2] for row in rows if None in row or describing.digest_of(*row[:4]) != row[4]]
-    owners = select(Ended.seal, Named.object_name).join(Named, Named.object_id == Ended.object_id)
-    names = dict(transaction.execute(owners.where(state.IS_STATUS, state.IS_STATE)).all()) if wrong else {}
+    found = State(transaction)
+    owners = {line.seal: found.objects.get(line.object_id) for line in found.statuses.values()}
+    names = {seal: owner.object_name for seal, owner in owners.items() if owner is not None}
     for seal, what in sorted(wrong, key=lambda one: names.get(one[0]) or ""):
         yield CatalogFinding(CatalogProblem.DESCRIPTION_DAMAGED, names.get(seal), details={"descriptor": what})
 
 
-def _images(catalog: Catalog, changed: Collection[int]) -> Iterator[_RequiredImage]:
-    """Yield the images of the enrollments that are not ``changed``, and of the results."""
-    with catalog.database.read() as transaction:
-        ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
-    named = select(Named.object_name, _IMAGE.view_id, _IMAGE.image, _IMAGE.image_bytes).select_from(NAMED_IMAGES)
-    named = named.outerjoin(Enrollment, Enrollment.id == _IMAGE.enrollment_id).outerjoin(Named, _OWNS)
-    for part in (*portions([one for one in ids if one not in changed], _ENROLLMENTS), None):
-        of_these = _IMAGE.enrollment_id.is_(None) if part is None else _IMAGE.enrollment_id.in_(part)
-        with catalog.database.read() as transaction:
-            found = transaction.execute(named.where(of_these, _IMAGE.image.is_not(None))).all()
-        yield from (_RequiredImage(*one) for one in found)
+def _images(transaction: Transaction, changed: Collection[int]) -> list[_RequiredImage]:
+    """Return the images of the enrollments that are not ``changed``, and of the results."""
+    state = State(transaction)
+    owners = dict(transaction.execute(select(Enrollment.id, Enrollment.object_id)).all())
+    named = select(_IMAGE.enrollment_id, _IMAGE.view_id, _IMAGE.image, _IMAGE.image_bytes).where(
+        _IMAGE.image.is_not(None), or_(_IMAGE.enrollment_id.is_(None), _IMAGE.enrollment_id.not_in(changed))
+    )
+    found = []
+    for enrollment_id, *image in transaction.execute(named):
+        owner = state.objects.get(owners.get(enrollment_id))
+        found.append(_RequiredImage(None if owner is None else owner.object_name, *image))
+    return found
 
 
 def _check_images(store: Images, portion: Sequence[_RequiredImage]) -> list[CatalogFinding]:

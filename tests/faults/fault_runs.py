@@ -200,7 +200,7 @@ def newest_views(catalog: Catalog) -> Sequence[View]:
     """Return the views of the newest enrollment, complete or not."""
     with catalog.database.read() as transaction:
         newest = transaction.scalar(select(func.max(Enrollment.id)))
-        found = state.enrollments(transaction, Enrollment.id == newest)
+        found = state.State(transaction).enrollments(Enrollment.id == newest)
         return found[0].enrollment.views if found else ()
 
 

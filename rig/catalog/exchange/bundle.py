@@ -20,12 +20,12 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from sqlalchemy import func, select
 
-from rig.catalog import state
 from rig.catalog.catalog import Catalog
 from rig.catalog.exchange.new_files import new_file
 from rig.catalog.facts import Enrollment
 from rig.catalog.images import Images, name_of, path_of
 from rig.catalog.jobs import finished
+from rig.catalog.state import State
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.catalog.upkeep import NAMED_IMAGES
 from rig.config.catalog_place import DATABASE_NAME
@@ -219,7 +219,7 @@ def _suspicious(info: ZipInfo) -> str:
 def _check_content(path: Path, catalog: Catalog, sizes: Mapping[str, int]) -> None:
     """Check that every enrollment is in use, and that exactly its images are in the bundle, with their stored sizes."""
     with catalog.database.read() as transaction:
-        if transaction.scalar(select(func.count(Enrollment.id))) != len(state.used(transaction)):
+        if transaction.scalar(select(func.count(Enrollment.id))) != len(State(transaction).used()):
             raise _rejected(path, "it contains an enrollment that is not complete or not in use")
         of_enrollments = select(_IMAGE.image, _IMAGE.image_bytes).where(_IMAGE.enrollment_id.is_not(None))
         named = {str(name): size for name, size in transaction.execute(of_enrollments)}

@@ -13,7 +13,7 @@ from rig.catalog import Action, Catalog, derived
 from rig.catalog.facts import Derived
 from rig.catalog.results import find_result
 from rig.catalog.results import record as record_result
-from rig.catalog.state import used
+from rig.catalog.state import State
 from rig.catalog.upkeep import YOUNG_S, collect_garbage
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
@@ -164,7 +164,7 @@ class TestGarbage:
         catalog.delete("mug")
         collect_garbage(catalog)
         with catalog.database.read() as transaction:
-            left = {one.seal for one in used(transaction)}
+            left = {one.seal for one in State(transaction).used()}
             assert set(transaction.scalars(select(Derived.seal))) == left
         assert len(left) == 1
 

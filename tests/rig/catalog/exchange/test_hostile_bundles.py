@@ -105,7 +105,7 @@ class TestHostileBundles:
             ("DELETE FROM views WHERE view_index = 1", "belongs to no view|changed after"),
             ("UPDATE log SET finished_utc = NULL", "changed after"),
             ("UPDATE log SET status = 'in progress'", "not complete"),
-            ("UPDATE log SET status = 'finished'", "not complete"),
+            ("UPDATE log SET status = 'finished'", "not a valid EnrollmentStatus"),
             ("UPDATE log SET object_id = 9", "owner of an enrollment"),
             ("UPDATE properties SET value = '2' WHERE key = 'version'", "another version"),
             ("UPDATE properties SET value = 'x' WHERE key = 'head'", "end of its log"),
