@@ -16,10 +16,9 @@ from sqlalchemy import and_, bindparam, delete, or_, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
-from rig.catalog.database import Database
+from rig.catalog.database import Database, open_database
 from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
-from rig.catalog.opening import open_database
 from rig.catalog.records import MAX_VIEWS, EnrollmentStatus, Provenance, as_json, checked_texts, clean_name, is_plan
 from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary, State
 from rig.config.catalog_place import CatalogPlace

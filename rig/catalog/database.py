@@ -9,12 +9,13 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, Engine, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import damaged
-from rig.catalog.facts import SCHEMA_VERSION, Property, Row
-from rig.catalog.images import Images
+from rig.catalog.facts import SCHEMA_VERSION, Property
+from rig.catalog.failures import catalog_errors
+from rig.catalog.images import open_images
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogError
 
@@ -22,11 +23,20 @@ APPLICATION = "hbr-rig catalog"
 
 
 class Database(ABC):
-    """The database of a catalog, and the store of its images."""
+    """The database of a catalog, and the store of its images. Parameters and errors are those of `Catalog.open`."""
 
-    place: CatalogPlace
-    images: Images
-    read_only: bool
+    def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
+        self.place = place
+        self.images = open_images(place)
+        self.read_only = read_only
+        self._busy_timeout_s = busy_timeout_s
+        self._reads, self._writes = self._engines()
+        try:
+            with self.catalog_errors():
+                self._open(create=create and not read_only)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def root(self) -> Path:
@@ -36,45 +46,58 @@ class Database(ABC):
     @contextmanager
     def read(self) -> Iterator[Transaction]:
         """Yield a transaction that sees the catalog as it is at its first query."""
-        with self.catalog_errors(), self._reading() as connection, _transaction(connection) as transaction:
-            yield transaction
+        with self.catalog_errors(), self._reads.begin() as connection:
+            self._begin(connection, writes=False)
+            with _transaction(connection) as transaction:
+                yield transaction
 
     @contextmanager
     def write(self) -> Iterator[Transaction]:
         """Yield a transaction that adds to the catalog. An exception rolls it back. No other one runs meanwhile."""
         if self.read_only:
             raise CatalogError(f"The catalog {self.place} is open for reading only.", next_step="Open it for writing.")
-        with self.catalog_errors(), self._writing() as connection, _transaction(connection) as transaction:
-            yield transaction
-            transaction.flush()
+        with self.catalog_errors(), self._writes.begin() as connection:
+            self._begin(connection, writes=True)
+            with _transaction(connection) as transaction:
+                yield transaction
+                transaction.flush()
 
-    @abstractmethod
     def close(self) -> None:
         """Close all connections."""
+        self._reads.dispose()
 
-    @abstractmethod
-    def _reading(self) -> AbstractContextManager[Connection]: ...
-
-    @abstractmethod
-    def _writing(self) -> AbstractContextManager[Connection]: ...
-
-    @abstractmethod
     def catalog_errors(self) -> AbstractContextManager[None]:
         """Raise errors of the database and of the store of images as errors of the catalog."""
+        return catalog_errors(self.place, self._busy_timeout_s)
+
+    @abstractmethod
+    def _engines(self) -> tuple[Engine, Engine]:
+        """Return the engines of transactions that read and that write, with one pool of connections."""
+
+    @abstractmethod
+    def _open(self, *, create: bool) -> None:
+        """Check the database; ``create`` it if there is none."""
+
+    @abstractmethod
+    def _begin(self, connection: Connection, *, writes: bool) -> None:
+        """Begin a transaction: one that ``writes`` waits until no other one does."""
 
     def damage(self, transaction: Transaction) -> list[str]:  # noqa: ARG002 - a server checks its own pages
         """Return what the database's own check of its structure finds."""
         return []
 
 
+def open_database(place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> Database:
+    """Return the database of a catalog with the engine that its place names."""
+    if place.url is None:
+        from rig.catalog.sqlite_database import SqliteDatabase as Kind
+    else:
+        from rig.catalog.postgres import PostgresDatabase as Kind  # type: ignore[assignment] # the package may be missing
+    return Kind(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s)
+
+
 def _transaction(connection: Connection) -> Transaction:
     return Transaction(connection, expire_on_commit=False, autoflush=True)
-
-
-def create_tables(connection: Connection) -> None:
-    """Create the tables of a new catalog."""
-    Row.metadata.create_all(connection)
-    connection.execute(insert(Property), first_properties())
 
 
 def first_properties() -> list[dict[str, str]]:

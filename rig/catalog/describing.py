@@ -21,10 +21,9 @@ import hbr
 from hbr.descriptors import Descriptor, descriptor, names
 from hbr.descriptors.network import PACKAGE
 from hbr.kernels.library import THREADS
-from rig.catalog.database import Database
+from rig.catalog.database import Database, open_database
 from rig.catalog.facts import Derived, Enrollment, Session, View, seal_of
 from rig.catalog.images import Images
-from rig.catalog.opening import open_database
 from rig.catalog.records import JsonObject, Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogDamaged, CatalogError, ExtraMissing, RigError, UsageError

@@ -1,4 +1,4 @@
-"""Errors of SQLite and of the file system as errors of the catalog."""
+"""Errors of SQLite, of a database server and of the file system as errors of the catalog."""
 
 import errno
 import sqlite3
@@ -8,59 +8,50 @@ from pathlib import Path
 from typing import Final
 
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
-from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
+from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogUnavailable, RigError
 from rig.core.next_steps import Do
 
 
 @contextmanager
-def catalog_errors(root: Path, busy_timeout_s: float) -> Iterator[None]:
-    """Raise errors of SQLite and of the file system as errors of the catalog in the folder ``root``."""
+def catalog_errors(place: CatalogPlace, busy_timeout_s: float) -> Iterator[None]:
+    """Raise errors of the database, of the store of images, and of the file system as errors of the catalog."""
     try:
         yield
     except (DBAPIError, sqlite3.Error) as error:
-        known = _of_sqlite(error.orig if isinstance(error, DBAPIError) else error, root, busy_timeout_s)
-        if known is None:
-            raise
-        raise known from error
-    except (UnicodeDecodeError, OverflowError) as error:  # text that is none, or a number that no program stored
-        raise _damaged(root, {"sqlite": str(error)}) from error
-    except OSError as error:
-        raise _of_system(error, root) from error
-
-
-@contextmanager
-def server_errors(place: CatalogPlace, busy_timeout_s: float) -> Iterator[None]:
-    """Raise errors of a database server and of a store of images as errors of the catalog."""
-    try:
-        yield
-    except DBAPIError as error:
-        known = _of_server(error, place, busy_timeout_s)
+        of_engine = _of_sqlite if place.url is None else _of_server
+        known = of_engine(error.orig if isinstance(error, DBAPIError) else error, place, busy_timeout_s)
         if known is None:
             raise
         raise known from error
     except PoolTimeout as error:
         raise _unavailable(place, error) from error
+    except (UnicodeDecodeError, OverflowError) as error:  # text that is none, or a number that no program stored
+        raise _damaged(place, {"sqlite": str(error)}) from error
     except OSError as error:
         raise _of_system(error, place.images or place.path) from error
 
 
-_GONE: Final = ("08", "57P")
-"""Beginnings of SQLSTATE: connection errors, and a server that stops or starts."""
+def _busy(place: CatalogPlace, busy_timeout_s: float, evidence: dict[str, str]) -> CatalogBusy:
+    return CatalogBusy(
+        f"Another process has been using the catalog {place} for {busy_timeout_s:g} s. Nothing was changed.",
+        next_step="Wait until it has finished, and try again.",
+        evidence=evidence,
+    )
 
 
-def _of_server(error: DBAPIError, place: CatalogPlace, busy_timeout_s: float) -> RigError | None:
-    state = getattr(error.orig, "sqlstate", None) or ""
-    evidence = {"sqlstate": state, "server": str(error.orig)}
+_GONE: Final = ("08", "57P", "25P03")
+"""Beginnings of SQLSTATE: errors of a connection, a server that stops or starts, and a transaction that was idle."""
+
+
+def _of_server(error: BaseException | None, place: CatalogPlace, busy_timeout_s: float) -> RigError | None:
+    state = getattr(error, "sqlstate", None) or ""
+    evidence = {"sqlstate": state, "server": str(error)}
     if state == "55P03":
-        return CatalogBusy(
-            f"Another process has been using the catalog {place} for {busy_timeout_s:g} s. Nothing was changed.",
-            next_step="Wait until it has finished, and try again.",
-            evidence=evidence,
-        )
+        return _busy(place, busy_timeout_s, evidence)
     if state.startswith("53"):
         return CatalogError(
             f"The server of the catalog {place} has no space or memory left. This change was not stored. All earlier "
@@ -70,16 +61,14 @@ def _of_server(error: DBAPIError, place: CatalogPlace, busy_timeout_s: float) ->
         )
     if state.startswith("28") or state in ("42501", "3D000", "25006"):
         return CatalogError(
-            f"The server denies access to the catalog {place}: {error.orig}.",
+            f"The server denies access to the catalog {place}: {error}.",
             next_step="Check catalog.url, ~/.pgpass and the rights of the user on the server.",
             evidence=evidence,
         )
-    if (
-        state.startswith(_GONE)
-        or state == "25P03"
-        or (not state and isinstance(error, OperationalError | InterfaceError))
-    ):
-        return _unavailable(place, error.orig)
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    # An error of the connection itself has no code.
+    if state.startswith(_GONE) or (not state and kinds & {"OperationalError", "InterfaceError"}):
+        return _unavailable(place, error)
     return None
 
 
@@ -116,24 +105,19 @@ def absent(root: Path) -> CatalogError:
     )
 
 
-def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -> RigError | None:
-    evidence = {"sqlite": str(error)}
+def _of_sqlite(error: BaseException | None, place: CatalogPlace, busy_timeout_s: float) -> RigError | None:
+    evidence, root = {"sqlite": str(error)}, place.path
     match getattr(error, "sqlite_errorcode", 0) & 0xFF:
         case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED | sqlite3.SQLITE_PROTOCOL:
-            return CatalogBusy(
-                f"Another process has been writing to the catalog {root} for {busy_timeout_s:g} s. "
-                "Nothing was changed.",
-                next_step="Wait until it has finished, and try again.",
-                evidence=evidence,
-            )
+            return _busy(place, busy_timeout_s, evidence)
         case sqlite3.SQLITE_NOTADB:
             return CatalogError(
-                f"{root / DATABASE_NAME} is not a catalog.",
+                f"{place.database_file} is not a catalog.",
                 next_step="Give the folder of a catalog.",
                 evidence=evidence,
             )
         case sqlite3.SQLITE_CORRUPT:
-            return _damaged(root, evidence)
+            return _damaged(place, evidence)
         case sqlite3.SQLITE_FULL:
             return _of_system(OSError(errno.ENOSPC, str(error)), root)
         case sqlite3.SQLITE_CANTOPEN | sqlite3.SQLITE_READONLY | sqlite3.SQLITE_PERM:
@@ -141,13 +125,13 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
         case sqlite3.SQLITE_IOERR:
             return _of_system(OSError(errno.EIO, str(error)), root)
     if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.ProgrammingError):
-        return _damaged(root, evidence)
+        return _damaged(place, evidence)
     return None
 
 
-def _damaged(root: Path, evidence: dict[str, str]) -> CatalogDamaged:
+def _damaged(place: CatalogPlace, evidence: dict[str, str]) -> CatalogDamaged:
     return CatalogDamaged(
-        f"The catalog {root / DATABASE_NAME} is damaged.",
+        f"The catalog {place.database_file} is damaged.",
         next_step="Copy the folder, then restore the database from a backup.",
         evidence=evidence,
     )

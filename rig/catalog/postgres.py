@@ -3,18 +3,14 @@
 Decision: docs/decisions/0011.
 """
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import Any, Final
+from typing import Final
 
-from sqlalchemy import DDL, Connection, QueuePool, create_engine, event, func, select, text
+from sqlalchemy import DDL, Connection, Engine, QueuePool, create_engine, event, func, insert, select, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
-from rig.catalog.database import Database, check_properties, create_tables, properties
-from rig.catalog.facts import FACTS, Enrollment, Entry, Property, json_text
-from rig.catalog.failures import server_errors
-from rig.catalog.images import open_images
+from rig.catalog.database import Database, check_properties, first_properties, properties
+from rig.catalog.facts import FACTS, Enrollment, Entry, Property, Row, json_text
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
 from rig.core.files import json_values, make_folder
@@ -62,50 +58,26 @@ class PostgresDatabase(Database):
     """The database of a catalog on a PostgreSQL server.
 
     A commit is durable. A transaction that writes has the lock of the catalog. Readers have a snapshot and do not wait.
-
-    Parameters and errors are those of `rig.catalog.Catalog.open`.
     """
 
-    def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
-        self.place = place
-        self.images = open_images(place)
+    def _engines(self) -> tuple[Engine, Engine]:
+        place = self.place
         make_folder(place.path, within=next(one for one in place.path.parents if one.exists()), mode=0o700)
-        self.read_only = read_only
-        self._busy_timeout_s = busy_timeout_s
-        engine = _engine(place, busy_timeout_s)
-        self._snapshots = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
-        self._changes = engine.execution_options(isolation_level="READ COMMITTED")
-        self._dispose = engine.dispose
-        try:
-            with self.catalog_errors():
-                self._open(create=create and not read_only)
-        except BaseException:
-            self.close()
-            raise
+        engine = _engine(place, self._busy_timeout_s)
+        return (
+            engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True),
+            engine.execution_options(isolation_level="READ COMMITTED"),
+        )
 
-    def close(self) -> None:
-        self._dispose()
-
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with self._snapshots.begin() as connection:
-            check_properties(properties(connection), self.place)
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        with self._changes.begin() as connection:
+    def _begin(self, connection: Connection, *, writes: bool) -> None:
+        if writes:
             # The transaction sees what was committed before it got the lock: each query has a snapshot of its own.
             limit_idle(connection, LOST_BENCH_S)
             connection.execute(text(f"SELECT pg_advisory_xact_lock({_CATALOG})"))
-            check_properties(properties(connection), self.place)
-            yield connection
-
-    def catalog_errors(self) -> AbstractContextManager[None]:
-        return server_errors(self.place, self._busy_timeout_s)
+        check_properties(properties(connection), self.place)
 
     def _open(self, *, create: bool) -> None:
-        with self._changes.begin() as connection:
+        with self._writes.begin() as connection:
             if not _has_tables(connection):
                 if not create:
                     raise CatalogError(
@@ -114,7 +86,8 @@ class PostgresDatabase(Database):
                     )
                 connection.execute(select(func.pg_advisory_xact_lock(_CREATION)))
                 if not _has_tables(connection):  # else another process was faster
-                    create_tables(connection)
+                    Row.metadata.create_all(connection)
+                    connection.execute(insert(Property), first_properties())
             found = properties(connection)
         check_properties(found, self.place)
         self.id = found["id"]
@@ -155,7 +128,7 @@ def _has_tables(connection: Connection) -> bool:
     return bool(connection.execute(text(found), {"name": Property.__tablename__}).scalar())
 
 
-def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
+def _engine(place: CatalogPlace, busy_timeout_s: float) -> Engine:
     assert place.url is not None
     settings = {key: value.format(busy_ms=max(1, round(1000 * busy_timeout_s))) for key, value in _SETTINGS.items()}
     options = " ".join(f"-c {key}={value}" for key, value in settings.items())

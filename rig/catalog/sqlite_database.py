@@ -7,8 +7,7 @@ import os
 import re
 import sqlite3
 import sys
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,8 +19,7 @@ from sqlalchemy.orm import Session as Transaction
 from rig.catalog.columns import FIX
 from rig.catalog.database import APPLICATION, Database, check_properties, first_properties, properties
 from rig.catalog.facts import FACTS, SCHEMA_VERSION, Entry, Row, json_text
-from rig.catalog.failures import absent, catalog_errors
-from rig.catalog.images import open_images
+from rig.catalog.failures import absent
 from rig.catalog.places import check_folder
 from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
 from rig.core.errors import CatalogDamaged, CatalogError
@@ -49,42 +47,15 @@ class SqliteDatabase(Database):
 
     A commit is durable (WAL, synchronous FULL). A writer takes the write lock at the start of its transaction: it waits
     there, or the transaction succeeds. Readers never wait.
-
-    Parameters and errors are those of `rig.catalog.Catalog.open`.
     """
 
-    def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
-        self.place = place
-        self.images = open_images(place)
-        self._file = place.database_file
-        self.read_only = read_only
-        self._busy_timeout_s = busy_timeout_s
+    def _engines(self) -> tuple[Engine, Engine]:
         pool = QueuePool(self._connect, dialect=_dialect())  # type: ignore[arg-type] # typeshed: no DBAPIConnection
-        self._engine = Engine(pool, _dialect(), _URL, execution_options={"compiled_cache": _COMPILED})
-        event.listen(self._engine, "begin", _begin)
-        self._immediate = self._engine.execution_options(begin="BEGIN IMMEDIATE")
-        try:
-            with self.catalog_errors():
-                self._open(create=create and not read_only)
-        except BaseException:
-            self.close()
-            raise
+        engine = Engine(pool, _dialect(), _URL, execution_options={"compiled_cache": _COMPILED})
+        return engine, engine
 
-    def close(self) -> None:
-        self._engine.dispose()
-
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        with self._immediate.begin() as connection:
-            yield connection
-
-    def catalog_errors(self) -> AbstractContextManager[None]:
-        return catalog_errors(self.root, self._busy_timeout_s)
+    def _begin(self, connection: Connection, *, writes: bool) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
     def _open(self, *, create: bool) -> None:
         if not database_exists(self.root):
@@ -94,7 +65,7 @@ class SqliteDatabase(Database):
             parent = next(parent for parent in self.root.parents if parent.exists())
             make_folder(self.root, within=parent, mode=0o700)
             self._create()
-        with self._reading() as connection:
+        with self._reads.begin() as connection:
             _check_kind(connection, self.root)
             _check_schema(connection, self.root)
             check_properties(properties(connection), self.place)
@@ -130,7 +101,7 @@ class SqliteDatabase(Database):
     def _is_shareable(self) -> bool:
         # Readers of a WAL database share an index file beside it. If they may not create it and no writer has created
         # it, the catalog is an archive or on a read-only disk: SQLite must know that no process will write.
-        return os.access(self.root, os.W_OK) or self._file.with_name(f"{DATABASE_NAME}-wal").exists()
+        return os.access(self.root, os.W_OK) or self.place.database_file.with_name(f"{DATABASE_NAME}-wal").exists()
 
     def _create(self) -> None:
         """Create the database under another name and rename it when it is complete.
@@ -150,7 +121,7 @@ class SqliteDatabase(Database):
                 connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
                 connection.execute("COMMIT")
             try:
-                self._file.hardlink_to(made)
+                self.place.database_file.hardlink_to(made)
             except FileExistsError:  # another process was faster, or one was killed after it had created an empty file
                 self._replace_empty(made)
         sync_folder(self.root)
@@ -158,8 +129,8 @@ class SqliteDatabase(Database):
     def _replace_empty(self, made: Path) -> None:
         with closing(self._connect()) as lock:
             lock.execute("BEGIN EXCLUSIVE")  # only one of the processes that find the same empty file continues
-            if not self._file.stat().st_size:
-                made.replace(self._file)
+            if not self.place.database_file.stat().st_size:
+                made.replace(self.place.database_file)
 
 
 def connect(root: Path, mode: str, busy_timeout_s: float) -> sqlite3.Connection:
@@ -253,7 +224,3 @@ def _definitions() -> tuple[str, ...]:
         Row.metadata.create_all(create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool))
         rows = connection.execute("SELECT sql FROM sqlite_master WHERE name NOT GLOB 'sqlite_*' ORDER BY rowid")
         return tuple(definition for (definition,) in rows)
-
-
-def _begin(connection: Connection) -> None:
-    connection.exec_driver_sql(connection.get_execution_options().get("begin", "BEGIN"))

@@ -13,8 +13,8 @@ from hashlib import sha256
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import ColumnElement, Select, func, or_, select
-from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import InstrumentedAttribute, selectinload
+from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import digests, log
 from rig.catalog.columns import damaged
