@@ -83,23 +83,32 @@ def described(
     Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
     """
     kinds = wanted or DESCRIPTORS
-    seal = seal_of(enrollment)
+    seal, count = seal_of(enrollment), len(enrollment.views)
     needed = kinds if all(descriptor(kind).whole_image for kind in kinds) else (SEGMENTATION, *kinds)
     with database.read() as transaction:
         stored = {kind: found.get(seal, b"") for kind, found in stored_contents(transaction, [seal], needed).items()}
     if all(stored.values()):
-        packed = {kind: records_of(descriptor(kind), stored[kind])["packed"].tobytes() for kind in kinds}
-        levels = {kind: descriptor(kind).unpack_rows(content) for kind, content in packed.items()}
-        count = len(enrollment.views)
         # What this program has not made is computed again.
         with suppress(ValueError, TypeError, AttributeError, RigError):
-            return Described(
-                levels, _evidence(stored[SEGMENTATION], count) if SEGMENTATION in needed else ({},) * count
-            )
+            return _parsed(stored, kinds, count)
     with database.catalog_errors():
-        found = _describe(reader(database.images.pixels, held), enrollment, name, kinds, threads=THREADS)
-    store(database, seal, _contents(enrollment, found))
-    return found
+        contents = computed(reader(database.images.pixels, held), enrollment, name, kinds, threads=THREADS)
+    store(database, seal, contents)
+    return _parsed(contents, kinds, count)
+
+
+def _parsed(contents: Mapping[str, bytes], kinds: Sequence[str], views: int) -> Described:
+    """Return a description from its contents by kind; an error if this program would not have stored them."""
+    packed = {kind: records_of(descriptor(kind), contents[kind])["packed"].tobytes() for kind in kinds}
+    levels = {kind: descriptor(kind).unpack_rows(rows) for kind, rows in packed.items()}
+    if SEGMENTATION not in contents:
+        return Described(levels, ({},) * views)
+    evidence = tuple(json_values(contents[SEGMENTATION]))
+    if len(evidence) != views:
+        raise ValueError("the evidence of other views")
+    for one in evidence:
+        check_evidence(one)
+    return Described(levels, evidence)
 
 
 # Segment again
@@ -167,13 +176,44 @@ def reader(read: Callable[[str], Pixels], held: Mapping[str, Pixels] | None = No
 
 
 def computed(
-    pixels: Callable[[str], Pixels], enrollment: Enrollment, name: str, kinds: tuple[str, ...]
+    pixels: Callable[[str], Pixels], enrollment: Enrollment, name: str, kinds: Sequence[str], *, threads: int = 1
 ) -> dict[str, bytes]:
     """Return the contents of the description of an object's enrollment, by kind; ``pixels`` reads an image.
 
     Raises `CatalogError`: a view cannot be described. Its evidence has the view's place and the reason.
     """
-    return _contents(enrollment, _describe(pixels, enrollment, name, kinds))
+    views = enrollment.views
+    packed: dict[str, list[bytes]] = {kind: [b""] * len(views) for kind in kinds}
+    evidence: list[dict[str, Any]] = [{}] * len(views)
+    # Descriptors of the whole image need no other view. The others describe what the segmentation cuts out.
+    whole = [kind for kind in kinds if descriptor(kind).whole_image]
+    cut_out = tuple(sorted(set(kinds).difference(whole)))
+    learned = _learned(pixels, enrollment, name, cut_out) if cut_out else {}
+
+    def describe_view(place: int) -> None:
+        view = views[place]
+        with _reasons(name, place):
+            image = pixels(view.image)
+            levels = {kind: descriptor(kind).describe(within(image, view.region)) for kind in whole}
+            if cut_out:
+                describer, number = learned[place]
+                found = describer.describe(number, image, view.azimuth_deg)
+                levels |= {kind: found.levels[kind] for kind in cut_out}
+                evidence[place] = found.segmentation or {}
+            for kind, row in levels.items():
+                packed[kind][place] = descriptor(kind).pack(row)
+
+    # The views are independent now, so their order and the number of threads do not change the result.
+    with ThreadPoolExecutor(threads, "describer") as pool:
+        list((pool.map if threads > 1 else map)(describe_view, range(len(views))))
+    azimuths_deg = [view.azimuth_deg for view in views]
+    contents = {}
+    for kind, rows in packed.items():
+        levels_of = np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), -1)
+        contents[kind] = content_of(descriptor(kind), levels_of, azimuths_deg)
+    if any(evidence):
+        contents[SEGMENTATION] = json.dumps(evidence).encode()
+    return contents
 
 
 def describe_one(images: Images, kinds: tuple[str, ...], one: tuple[str, Enrollment]) -> dict[str, bytes] | str:
@@ -186,41 +226,6 @@ def describe_one(images: Images, kinds: tuple[str, ...], one: tuple[str, Enrollm
         return computed(reader(images.pixels), enrollment, name, kinds)
     except (CatalogError, UsageError) as error:
         return error.what.rstrip(".")
-
-
-def _describe(
-    pixels: Callable[[str], Pixels], enrollment: Enrollment, name: str, kinds: tuple[str, ...], *, threads: int = 1
-) -> Described:
-    views, none = enrollment.views, np.empty(0, np.uint8)
-    levels = {kind: [none] * len(views) for kind in kinds}
-    evidence: list[dict[str, Any]] = [{}] * len(views)
-    # Descriptors of the whole image need no other view. The others describe what the segmentation cuts out.
-    whole = [kind for kind in kinds if descriptor(kind).whole_image]
-    cut_out = tuple(sorted(set(kinds).difference(whole)))
-    learned = _learned(pixels, enrollment, name, cut_out) if cut_out else {}
-
-    def describe_view(place: int) -> None:
-        view = views[place]
-        with _reasons(name, place):
-            image = pixels(view.image)
-            part = within(image, view.region)
-            for kind in whole:
-                levels[kind][place] = descriptor(kind).describe(part)
-            if cut_out:
-                describer, number = learned[place]
-                found = describer.describe(number, image, view.azimuth_deg)
-                for kind in cut_out:
-                    levels[kind][place] = found.levels[kind]
-                evidence[place] = found.segmentation or {}
-
-    # The views are independent now, so their order and the number of threads do not change the result.
-    if threads == 1:
-        for place in range(len(views)):
-            describe_view(place)
-    else:
-        with ThreadPoolExecutor(threads, "describer") as pool:
-            list(pool.map(describe_view, range(len(views))))
-    return Described({kind: np.stack(rows) for kind, rows in levels.items()}, tuple(evidence))
 
 
 def _learned(
@@ -298,17 +303,6 @@ def digest_of(seal: str, what: str, made_by: str, content: bytes) -> str:
     return digest.hexdigest()
 
 
-def _contents(enrollment: Enrollment, found: Described) -> dict[str, bytes]:
-    contents = {}
-    for name, levels in found.levels.items():
-        kind = descriptor(name)
-        packed = np.frombuffer(b"".join(map(kind.pack, levels)), np.uint8).reshape(len(levels), -1)
-        contents[name] = content_of(kind, packed, [view.azimuth_deg for view in enrollment.views])
-    if any(found.segmentation):
-        contents[SEGMENTATION] = json.dumps(found.segmentation).encode()
-    return contents
-
-
 def store(database: Database, seal: str, contents: Mapping[str, bytes]) -> None:
     """Store a description by kind; it is computed again if this fails."""
     rows = [row_of(seal, what, content) for what, content in contents.items()]
@@ -359,14 +353,4 @@ def stored_contents(
             and digest_of(seal, what, made_by, content) == sha256
             and not len(content) % size
         }
-    return found
-
-
-def _evidence(content: bytes, views: int) -> tuple[dict[str, Any], ...]:
-    """Return the evidence of each view; an error if there is none that this program would have stored."""
-    found = tuple(json_values(content))
-    if len(found) != views:
-        raise ValueError("the evidence of other views")
-    for one in found:
-        check_evidence(one)
     return found

@@ -22,7 +22,6 @@ from sqlalchemy import (
     ForeignKey,
     ForeignKeyConstraint,
     Index,
-    MetaData,
     UniqueConstraint,
     event,
     inspect,
@@ -76,16 +75,6 @@ class Action(StrEnum):
 
 class Row(MappedAsDataclass, DeclarativeBase, kw_only=True, eq=False):
     """A row of a catalog."""
-
-    metadata = MetaData(
-        naming_convention={
-            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
-            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
-            "ck": "ck_%(table_name)s_%(constraint_name)s",
-            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
-            "pk": "pk_%(table_name)s",
-        }
-    )
 
 
 class Property(Row):
@@ -309,18 +298,6 @@ def seal_of(enrollment: Enrollment) -> str:
     """Return the digest of an enrollment with its sessions and views, by their own digests."""
     parts: Sequence[Session | View] = (*enrollment.sessions, *enrollment.views)
     return sha256_of((enrollment.digest, *(part.digest for part in parts)))
-
-
-def damaged_parts(enrollment: Enrollment, seal: str | None) -> list[Enrollment | Session | View]:
-    """Return the parts of an enrollment that are not as they were written.
-
-    The enrollment itself is among them if ``seal`` is given and is not its own: a part is missing or was exchanged.
-    """
-    parts: list[Enrollment | Session | View] = [enrollment, *enrollment.sessions, *enrollment.views]
-    wrong = [part for part in parts if part.digest != digest_of(part, enrollment.key)]
-    if seal is not None and seal != seal_of(enrollment) and enrollment not in wrong:
-        wrong.insert(0, enrollment)
-    return wrong
 
 
 def _as_stored(column: ColumnElement[Any], value: Any) -> Any:

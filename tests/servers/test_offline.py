@@ -63,8 +63,7 @@ def same_copy(place: CatalogPlace, catalog: Catalog) -> Catalog:
     return copy
 
 
-def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.catalog.copying._AT_ONCE", 1)
+def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace) -> None:
     with Catalog.open(place, clock=CLOCK) as catalog:
         assert not update_copy(catalog)
         same_copy(place, catalog).close()

@@ -166,7 +166,7 @@ class TestOnlyOnce:
         catalog = open_catalog("catalog")
         run_import(catalog, CatalogSource(full), once=True)
         expected = model(full)
-        monkeypatch.setattr("rig.catalog.describing._describe", None)
+        monkeypatch.setattr("rig.catalog.describing.computed", None)
         assert model(catalog) == expected
 
     def test_damaged_image_of_a_catalog_is_not_transferred(self, full: Catalog, open_catalog: OpenCatalog) -> None:

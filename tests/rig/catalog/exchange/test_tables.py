@@ -146,6 +146,6 @@ def test_description_of_a_table_is_computed_once(
     catalog = open_catalog("catalog")
     run_import(catalog, read_folder(tmp_path / "in", now=NOW))
     write_views(tmp_path / "a.parquet", CatalogSource(catalog), TableFormat.PARQUET)
-    monkeypatch.setattr("rig.catalog.describing._describe", None)
+    monkeypatch.setattr("rig.catalog.describing.computed", None)
     write_views(tmp_path / "b.parquet", CatalogSource(catalog), TableFormat.PARQUET)
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
