@@ -1,9 +1,9 @@
 """The catalog: objects with their enrollments and views. An enrollment in progress gets views until it is finished."""
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from os import PathLike
@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import and_, bindparam, delete, or_, select
+from sqlalchemy import delete, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
@@ -89,18 +89,28 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Where the catalog is."""
         return self.database.place
 
+    @contextmanager
+    def reading(self) -> Iterator[State]:
+        """Yield the state of the catalog; for the other modules of this package, as ``database``."""
+        with self.database.read() as transaction:
+            yield State(transaction)
+
+    @contextmanager
+    def writing(self) -> Iterator[State]:
+        """Yield the state of the catalog before a change. An exception undoes the change."""
+        with self.database.write() as transaction:
+            yield State(transaction)
+
     # What is enrolled
 
     def objects(self, *, deleted: bool = False) -> list[ObjectSummary]:
         """Return the objects in use in the order in which they were added, or the deleted ones that can be restored."""
-        with self.database.read() as transaction:
-            found = State(transaction)
+        with self.reading() as found:
             return found.summaries(found.deleted() if deleted else found.in_use())
 
     def summary(self, name: str) -> ObjectSummary:
         """Return an object without its enrollments and views; errors as for `object`."""
-        with self.database.read() as transaction:
-            found = State(transaction)
+        with self.reading() as found:
             return found.summaries([found.find(name)])[0]
 
     def object(self, name: str) -> ObjectDetails:
@@ -108,24 +118,22 @@ class Catalog(AbstractContextManager["Catalog"]):
 
         Raises `ObjectNotFound`: there is no object of that name. `CatalogDamaged`: an enrollment of it is missing.
         """
-        with self.database.read() as transaction:
-            found = State(transaction)
+        with self.reading() as found:
             known = found.find(name)
             found.check_present(known.object_id)
             return ObjectDetails(found.summaries([known])[0], tuple(found.enrollments_of(known.object_id)))
 
     def first_views(self) -> dict[str, int]:
         """Return the id of one view of each object in use, to show the object by."""
-        with self.database.read() as transaction:
-            found = State(transaction)
+        with self.reading() as found:
             names = {one.enrollment_id: one.name for one in found.used()}
             rows = found.first_views(View.enrollment_id, View.id)
             return {names[enrollment_id]: view_id for enrollment_id, view_id in rows}
 
     def version(self) -> str:
         """Return a digest of what searches compare with, SHA-256: another one after every change of the objects."""
-        with self.database.read() as transaction:
-            return State(transaction).version()
+        with self.reading() as found:
+            return found.version()
 
     def damage(self) -> CatalogDamaged | None:
         """Return the error that an object is not as it was stored; None if all are.
@@ -133,8 +141,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         Compares digests of rows, not of images. `rig.catalog.verify` compares everything.
         """
         try:
-            with self.database.read() as transaction:
-                State(transaction).check_everything()
+            with self.reading() as found:
+                found.check_everything()
         except CatalogDamaged as error:
             return error
         return None
@@ -176,8 +184,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Raise what `begin`, or with ``resume`` `resume`, would raise for this object now; change nothing."""
         name = clean_name(name)
         checked_texts(label, note)
-        with self.database.read() as transaction:
-            found = State(transaction)
+        with self.reading() as found:
             if resume:
                 found.unfinished(found.find(name))
             elif not replace and (known := found.named(name)) is not None:
@@ -219,25 +226,22 @@ class Catalog(AbstractContextManager["Catalog"]):
         texts = checked_texts(label, note)
         png = None if empty_table is None else images.encode(empty_table)
         now = self.clock.utc()
-        with self.database.write() as transaction:
-            before = State(transaction)
-            known = before.named(name)
+        with self.writing() as found:
+            known = found.named(name)
             if known is not None:
                 if not replace:
-                    before.check_not_enrolled(known)
-                before.end_current(self.clock, known, EnrollmentStatus.IN_PROGRESS)
-            object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
-            assert object_id is not None
+                    found.check_not_enrolled(known)
+                found.end_current(self.clock, known, EnrollmentStatus.IN_PROGRESS)
+            object_id = found.id_of(known)
             # The enrollment, its digest, and the line of the log are one fact: all are written, or none.
             enrollment = Enrollment(
                 key=secrets.token_hex(32), object_id=object_id, started_utc=now, planned_azimuth_deg=plan
             )
             enrollment.digest = digest_of(enrollment, enrollment.key)
-            transaction.add(enrollment)
-            transaction.flush()
+            found.transaction.add(enrollment)
+            found.transaction.flush()
             changed = state.new_columns(now, texts) if known is None else state.columns(known, texts) if texts else {}
-            log.append(
-                transaction,
+            found.append(
                 self.clock,
                 Action.ENROLLMENT_STARTED,
                 name,
@@ -246,15 +250,14 @@ class Catalog(AbstractContextManager["Catalog"]):
                 status=EnrollmentStatus.IN_PROGRESS,
                 details={"enrollment_id": enrollment.id, "views": len(plan), "replace": replace},
             )
-            return self._start_session(transaction, enrollment, name, provenance, png)
+            return self._start_session(found.transaction, enrollment, name, provenance, png)
 
     def resumable(self, name: str) -> EnrollmentState | None:
         """Return the unfinished enrollment of an object, or None.
 
         Raises `ObjectNotFound`: there is no object of that name.
         """
-        with self.database.read() as transaction:
-            found = State(transaction)
+        with self.reading() as found:
             return found.of_status(found.find(name), EnrollmentStatus.IN_PROGRESS)
 
     def resume(
@@ -266,13 +269,11 @@ class Catalog(AbstractContextManager["Catalog"]):
         storing fails.
         """
         png = None if empty_table is None else images.encode(empty_table)
-        with self.database.write() as transaction:
-            found = State(transaction)
+        with self.writing() as found:
             known = found.find(name)
             enrollment, name = found.unfinished(known).enrollment, str(known.object_name)
-            details = {"enrollment_id": enrollment.id}
-            log.append(transaction, self.clock, Action.ENROLLMENT_RESUMED, name, details=details)
-            return self._start_session(transaction, enrollment, name, provenance, png)
+            found.append(self.clock, Action.ENROLLMENT_RESUMED, name, details={"enrollment_id": enrollment.id})
+            return self._start_session(found.transaction, enrollment, name, provenance, png)
 
     # Change objects
 
@@ -283,14 +284,13 @@ class Catalog(AbstractContextManager["Catalog"]):
         `ObjectExists`: another object has the new name.
         """
         new_name = clean_name(new_name)
-        with self.database.write() as transaction:
-            found = State(transaction)
+        with self.writing() as found:
             known = found.find(name)
             if new_name == known.object_name:
                 return
             found.check_free(new_name)
             before = {"before": known.object_name}
-            log.append(transaction, self.clock, Action.RENAMED, new_name, **state.columns(known), details=before)
+            found.append(self.clock, Action.RENAMED, new_name, **state.columns(known), details=before)
 
     def set_texts(self, name: str, *, label: str | None = None, note: str | None = None) -> None:
         """Change the label and the note of an object. None leaves them unchanged.
@@ -298,21 +298,20 @@ class Catalog(AbstractContextManager["Catalog"]):
         Raises `UsageError`: they are not valid text. `ObjectNotFound`: there is no object of that name.
         """
         texts = checked_texts(label, note)
-        with self.database.write() as transaction:
-            known = State(transaction).find(name)
+        with self.writing() as found:
+            known = found.find(name)
             if texts:
                 columns = state.columns(known, texts)
-                log.append(transaction, self.clock, Action.LABELLED, known.object_name, **columns, details=texts)
+                found.append(self.clock, Action.LABELLED, known.object_name, **columns, details=texts)
 
     def delete(self, *names: str) -> None:
         """Delete objects, all or none. `undelete` restores them until `collect_garbage` removes them.
 
         Raises `ObjectNotFound`: there is no object of one of these names.
         """
-        with self.database.write() as transaction:
-            for known in map(State(transaction).find, dict.fromkeys(names)):
-                columns = state.columns(known, deleted=True)
-                log.append(transaction, self.clock, Action.DELETED, known.object_name, **columns)
+        with self.writing() as found:
+            for known in map(found.find, dict.fromkeys(names)):
+                found.append(self.clock, Action.DELETED, known.object_name, **state.columns(known, deleted=True))
 
     def undelete(self, name: str) -> None:
         """Restore the object that was deleted last under this name.
@@ -320,11 +319,10 @@ class Catalog(AbstractContextManager["Catalog"]):
         Raises `ObjectNotFound`: there is no deleted object of that name. `ObjectExists`: an object in use has this
         name.
         """
-        with self.database.write() as transaction:
-            found = State(transaction)
+        with self.writing() as found:
             known = found.find(name, deleted=True)
             found.check_free(str(known.object_name))
-            log.append(transaction, self.clock, Action.UNDELETED, known.object_name, **state.columns(known))
+            found.append(self.clock, Action.UNDELETED, known.object_name, **state.columns(known))
 
     # The log
 
@@ -360,20 +358,6 @@ class Catalog(AbstractContextManager["Catalog"]):
         transaction.add(session)
         transaction.flush()
         return OpenEnrollment(self, enrollment, name, session)
-
-
-# Each view asks these, and so not for the whole state. To build a statement takes longer than to execute it.
-_LINES = (
-    select(Entry.deleted, Entry.status)
-    .where(
-        or_(
-            and_(Entry.object_id == bindparam("object_id"), Entry.deleted.is_not(None)),
-            and_(Entry.enrollment_id == bindparam("id"), Entry.status.is_not(None)),
-        )
-    )
-    .order_by(Entry.id)
-)
-_PRESENT = select(View.index).where(View.enrollment_id == bindparam("id"))
 
 
 @dataclass(eq=False)
@@ -422,9 +406,9 @@ class OpenEnrollment:
                 next_step="Start a new enrollment with a larger plan.",
             )
         png, database = store_image(self.catalog, view, image_bgr, encoded), self.catalog.database
-        with database.write() as transaction:
-            self._check_in_progress(transaction)
-            if view.index not in self._missing(transaction):
+        with self.catalog.writing() as found:
+            self._check_in_progress(found)
+            if view.index not in self._missing(found.transaction):
                 raise CatalogError(
                     f"View {view.index} of {self.object_name!r} is stored already.",
                     next_step="Continue with the missing views; check that no other process enrolls this object.",
@@ -433,8 +417,8 @@ class OpenEnrollment:
                 database.images.put(png)
             view.enrollment_id, view.session = self.id, self.session.number
             view.digest = digest_of(view, self.enrollment.key)
-            transaction.add(view)
-            transaction.flush()
+            found.transaction.add(view)
+            found.transaction.flush()
         hold(self._held, view.image, image_bgr)
         return view
 
@@ -447,9 +431,9 @@ class OpenEnrollment:
         progress.
         """
         database, clock = self.catalog.database, self.catalog.clock
-        with database.read() as transaction:
-            self._check_in_progress(transaction)
-            enrollment = State(transaction).enrollments(Enrollment.id == self.id)[0].enrollment
+        with self.catalog.reading() as found:
+            self._check_in_progress(found)
+            enrollment = found.enrollments(Enrollment.id == self.id)[0].enrollment
         if missing := enrollment.missing:
             raise CatalogError(
                 f"{len(missing)} of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r} "
@@ -458,29 +442,24 @@ class OpenEnrollment:
                 evidence={"missing_views": list(missing)},
             )
         described(database, enrollment, self.object_name, held=self._held)
-        with database.write() as transaction:
-            self._check_in_progress(transaction)
-            before = State(transaction)
-            known = before.by_id(enrollment.object_id)
-            before.end_current(clock, known, EnrollmentStatus.COMPLETE)
+        with self.catalog.writing() as found:
+            known = self._check_in_progress(found)
+            found.end_current(clock, known, EnrollmentStatus.COMPLETE)
             done = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, clock.utc())
-            log.append(transaction, clock, Action.ENROLLED, known.object_name, **state.ending(done))
+            found.append(clock, Action.ENROLLED, known.object_name, **state.ending(done))
 
     def abandon(self) -> None:
         """Abandon the enrollment. Its images stay, and the complete enrollment before it stays in use."""
-        with self.catalog.database.write() as transaction:
-            self._check_in_progress(transaction)
-            before = State(transaction)
-            known = before.by_id(self.enrollment.object_id)
-            before.end_current(self.catalog.clock, known, EnrollmentStatus.IN_PROGRESS)
+        with self.catalog.writing() as found:
+            found.end_current(self.catalog.clock, self._check_in_progress(found), EnrollmentStatus.IN_PROGRESS)
 
     def discard(self) -> None:
         """Remove an enrollment without views; an object that has no other enrollment goes with it.
 
         Raises `CatalogError`: the enrollment has views or is no longer in progress.
         """
-        with self.catalog.database.write() as transaction:
-            self._check_in_progress(transaction)
+        with self.catalog.writing() as found:
+            known, transaction = self._check_in_progress(found), found.transaction
             if len(self._missing(transaction)) < len(self.planned_azimuth_deg):
                 raise CatalogError(
                     f"The enrollment of {self.object_name!r} has views.",
@@ -488,40 +467,32 @@ class OpenEnrollment:
                 )
             transaction.execute(delete(Session).where(Session.enrollment_id == self.id))
             transaction.execute(delete(Enrollment).where(Enrollment.id == self.id))
-            object_id = self.enrollment.object_id
-            others = transaction.scalar(select(Enrollment.id).where(Enrollment.object_id == object_id).limit(1))
-            known = State(transaction).by_id(object_id)
-            gone = state.columns(known, deleted=True)
-            log.append(
-                transaction,
-                self.catalog.clock,
-                Action.ENROLLMENT_DISCARDED,
-                known.object_name,
-                **(gone if others is None else {}),
-                enrollment_id=self.id,
-                details={"enrollment_id": self.id},
-            )
+            others = transaction.scalar(select(Enrollment.id).where(Enrollment.object_id == known.object_id).limit(1))
+            gone = state.columns(known, deleted=True) if others is None else {}
+            own = {"enrollment_id": self.id}
+            found.append(self.catalog.clock, Action.ENROLLMENT_DISCARDED, known.object_name, **gone, **own, details=own)
 
     def _missing(self, transaction: Transaction) -> tuple[int, ...]:
-        present = set(transaction.scalars(_PRESENT, {"id": self.id}))
+        present = set(transaction.scalars(select(View.index).where(View.enrollment_id == self.id)))
         return tuple(index for index in range(len(self.planned_azimuth_deg)) if index not in present)
 
-    def _check_in_progress(self, transaction: Transaction) -> None:
-        lines = transaction.execute(_LINES, {"id": self.id, "object_id": self.enrollment.object_id}).all()
-        deleted = [line.deleted for line in lines if line.deleted is not None]
-        statuses = [line.status for line in lines if line.status is not None]
-        if deleted[-1:] == [True]:
+    def _check_in_progress(self, found: State) -> Entry:
+        """Return the state of the object."""
+        known = found.by_id(self.enrollment.object_id)
+        if known.deleted:
             raise CatalogError(
                 f"{self.object_name!r} was deleted during its enrollment.",
                 next_step=(Do.UNDELETE(name=self.object_name), Do.CONTINUE_ENROLLMENT(name=self.object_name)),
             )
-        is_there = transaction.scalar(select(Enrollment.id).where(Enrollment.id == self.id)) is not None
-        if not is_there or statuses[-1:] != [EnrollmentStatus.IN_PROGRESS]:
-            status = statuses[-1] if is_there and statuses else "gone"
+        ended = found.statuses.get(self.id)
+        is_there = found.transaction.scalar(select(Enrollment.id).where(Enrollment.id == self.id)) is not None
+        status = ended.status if ended is not None and is_there else None
+        if status != EnrollmentStatus.IN_PROGRESS:
             raise CatalogError(
-                f"The enrollment of {self.object_name!r} is {status}, not in progress.",
+                f"The enrollment of {self.object_name!r} is {status or 'gone'}, not in progress.",
                 next_step="Start a new one.",
             )
+        return known
 
 
 def store_image(

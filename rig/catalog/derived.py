@@ -31,7 +31,6 @@ from rig.catalog.describing import (
 from rig.catalog.facts import Enrollment, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, processes
 from rig.catalog.records import Region
-from rig.catalog.state import State
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
@@ -51,10 +50,9 @@ def views(
     kind = known_descriptor(descriptor)
     # The descriptors of every enrolled view are computed from one segmentation.
     together = DESCRIPTORS if kind.name in DESCRIPTORS and not kind.whole_image else (kind.name,)
-    with catalog.database.read() as transaction:
-        state = State(transaction)
+    with catalog.reading() as state:
         wanted = state.used(checked=True)
-        found = stored_contents(transaction, [one.seal for one in wanted], (kind.name,))[kind.name]
+        found = stored_contents(state.transaction, [one.seal for one in wanted], (kind.name,))[kind.name]
         missing = []
         for one in wanted:
             if one.seal not in found:
@@ -120,9 +118,9 @@ def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, 
     Each region comes with the ids of the calibration results in force when its views were taken.
     """
     sessions, found = Session.__table__.c, set()
-    with catalog.database.read() as transaction:
-        ids = {one.enrollment_id for one in State(transaction).used()}
-        rows = transaction.execute(
+    with catalog.reading() as state:
+        ids = {one.enrollment_id for one in state.used()}
+        rows = state.transaction.execute(
             select(sessions.enrollment_id, sessions.conditions, View.region)
             .join(View, (View.enrollment_id == sessions.enrollment_id) & (View.session == sessions.number))
             .where(sessions.bench == bench, View.index == 0)

@@ -251,13 +251,12 @@ def _replaces(journal: Catalog, enrollment: Enrollment) -> bool:
 
 def _forget(journal: Catalog, name: str, key: str) -> None:
     """Remove a delivered object from the journal, unless it has been or is being enrolled again."""
-    with journal.database.write() as transaction:
-        found = state.State(transaction)
+    with journal.writing() as found:
         known = found.find(name)
         complete = found.of_status(known, EnrollmentStatus.COMPLETE)
         again = found.of_status(known, EnrollmentStatus.IN_PROGRESS) is not None
         if not again and complete is not None and complete.enrollment.key == key:
-            log.append(transaction, journal.clock, Action.DELETED, name, **state.columns(known, deleted=True))
+            found.append(journal.clock, Action.DELETED, name, **state.columns(known, deleted=True))
 
 
 def _is_waiting(transaction: Transaction) -> ColumnElement[bool]:

@@ -15,12 +15,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.catalog import log
 from rig.catalog.catalog import Catalog, store_image
 from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Session, View
 from rig.catalog.records import EnrollmentStatus, Provenance
-from rig.catalog.state import EnrollmentState, State, ending
+from rig.catalog.state import EnrollmentState, ending
 from rig.catalog.transfer import add_rows, digest, same_session, same_view
 from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
@@ -114,8 +113,7 @@ class Retake:
         new.views = [taken.get(view.index) or same_view(view) for view in former.views]
         digest(new, secrets.token_hex(32))
         described(database, new, self.object_name, held=self._held)
-        with database.write() as transaction:
-            before = State(transaction)
+        with self.catalog.writing() as before:
             known = before.by_id(former.object_id)
             current = before.of_status(known, EnrollmentStatus.COMPLETE)
             if known.deleted or current is None or current.enrollment.key != former.key:
@@ -126,8 +124,8 @@ class Retake:
             for view, png in self._taken.values():
                 if database.images.size(view.image) != len(png):  # `collect_garbage` removed it
                     database.images.put(png)
-            add_rows(transaction, new, former.object_id)
+            add_rows(before.transaction, new, former.object_id)
             before.end_current(clock, known, EnrollmentStatus.COMPLETE)
             columns = ending(EnrollmentState(new, EnrollmentStatus.COMPLETE, clock.utc()))
             columns["details"] |= {"taken_again": list(self.indices)}
-            log.append(transaction, clock, Action.ENROLLED, known.object_name, **columns)
+            before.append(clock, Action.ENROLLED, known.object_name, **columns)

@@ -106,14 +106,14 @@ class State:
     """
 
     def __init__(self, transaction: Transaction) -> None:
-        self._transaction = transaction
+        self.transaction = transaction
         self.objects: dict[int | None, Entry] = {line.object_id: line for line in transaction.scalars(_STATES)}
         self.statuses: dict[int | None, Entry] = {line.enrollment_id: line for line in transaction.scalars(_STATUSES)}
 
     def check(self) -> None:
         """Raise `CatalogDamaged` if a line of the state is missing or not as it was written."""
-        log.check_complete(self._transaction)
-        check_lines(self._transaction, {line.id for line in (*self.objects.values(), *self.statuses.values())})
+        log.check_complete(self.transaction)
+        check_lines(self.transaction, {line.id for line in (*self.objects.values(), *self.statuses.values())})
 
     def in_use(self) -> list[Entry]:
         """Return the states of the objects in use, unchecked."""
@@ -121,7 +121,7 @@ class State:
 
     def deleted(self) -> list[Entry]:
         """Return the states of the deleted objects that `collect_garbage` has not removed, unchecked."""
-        stored = set(self._transaction.scalars(select(Enrollment.object_id)))
+        stored = set(self.transaction.scalars(select(Enrollment.object_id)))
         return [line for line in self.objects.values() if line.deleted and line.object_id in stored]
 
     # Objects
@@ -161,8 +161,16 @@ class State:
         return self._checked(found)
 
     def _checked(self, line: Entry) -> Entry:
-        check_lines(self._transaction, [line.id])
+        check_lines(self.transaction, [line.id])
         return line
+
+    def id_of(self, known: Entry | None) -> int:
+        """Return the id of an object; for None that of the one which the next line of the log adds."""
+        return known.object_id if known and known.object_id else log.head(self.transaction)[0] + 1
+
+    def append(self, clock: Clock, action: Action, object_name: str | None, **columns: Any) -> None:
+        """Add a line to the log; this state stays as it was before."""
+        log.append(self.transaction, clock, action, object_name, **columns)
 
     def check_free(self, name: str) -> None:
         """Raise `ObjectExists` if an object in use has this name."""
@@ -178,8 +186,8 @@ class State:
         # Two statements for all objects together, and not one for each object.
         counts = select(View.enrollment_id, func.count()).group_by(View.enrollment_id)
         lengths = select(Enrollment.id, func.json_array_length(Enrollment.planned_azimuth_deg))
-        taken: dict[int | None, int] = dict(self._transaction.execute(counts).all())
-        planned: dict[int | None, int] = dict(self._transaction.execute(lengths).all())
+        taken: dict[int | None, int] = dict(self.transaction.execute(counts).all())
+        planned: dict[int | None, int] = dict(self.transaction.execute(lengths).all())
         current = {(line.object_id, line.status): line for line in self.statuses.values()}
         found = []
         for one in states:
@@ -213,7 +221,7 @@ class State:
         """
         if checked:
             self.check()
-        present = set(self._transaction.scalars(select(Enrollment.id)))
+        present = set(self.transaction.scalars(select(Enrollment.id)))
         names = {line.object_id: line.object_name for line in self.in_use()}
         rows = [
             (names[line.object_id], line.object_id, line.enrollment_id, line.seal)
@@ -238,7 +246,7 @@ class State:
         return [
             row
             for part in portions(ids, 500)
-            for row in self._transaction.execute(wanted.where(View.enrollment_id.in_(part)))
+            for row in self.transaction.execute(wanted.where(View.enrollment_id.in_(part)))
         ]
 
     def enrollments(self, condition: ColumnElement[bool]) -> list[EnrollmentState]:
@@ -250,16 +258,16 @@ class State:
             .order_by(Enrollment.id.desc())
             .execution_options(populate_existing=True)
         )
-        rows = self._transaction.scalars(wanted).all()
+        rows = self.transaction.scalars(wanted).all()
         endings = [self.statuses.get(one.id) for one in rows]
-        check_lines(self._transaction, [line.id for line in endings if line is not None])
+        check_lines(self.transaction, [line.id for line in endings if line is not None])
         wrong = self.damaged_enrollments([one.id for one in rows]) if rows else {}
         found = []
         for enrollment, ended in zip(rows, endings, strict=True):
             if ended is None or ended.status is None or enrollment.id in wrong or not is_possible(enrollment, ended):
                 raise changed([str(self.by_id(enrollment.object_id).object_name)])
             found.append(EnrollmentState(enrollment, ended.status, ended.finished_utc, ended.seal))
-        self._transaction.expunge_all()
+        self.transaction.expunge_all()
         return found
 
     def enrollments_of(self, object_id: int | None) -> list[EnrollmentState]:
@@ -308,7 +316,7 @@ class State:
         if before is not None:
             ended, action = CURRENT[status]
             one = replace(before, status=ended, finished_utc=before.finished_utc or clock.utc())
-            log.append(self._transaction, clock, action, known.object_name, **ending(one))
+            self.append(clock, action, known.object_name, **ending(one))
 
     # Damage
 
@@ -318,10 +326,10 @@ class State:
         Lines of the log are not checked.
         """
         owners = select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.id)
-        rows = dict(self._transaction.execute(owners if ids is None else owners.where(Enrollment.id.in_(ids))).all())
+        rows = dict(self.transaction.execute(owners if ids is None else owners.where(Enrollment.id.in_(ids))).all())
         endings = {number: self.statuses.get(number) for number in rows}
         seals = {number: None if line is None else line.seal for number, line in endings.items()}
-        wrong = set(digests.damaged_enrollments(self._transaction, seals))
+        wrong = set(digests.damaged_enrollments(self.transaction, seals))
         wrong |= {number for number, line in endings.items() if line is None or line.object_id != rows[number]}
         names = {number: line.object_name for number, line in self.objects.items()}
         return {number: names.get(owner) for number, owner in rows.items() if number in wrong}
@@ -336,11 +344,11 @@ class State:
             for number, line in self.statuses.items()
             if number is not None and object_id in (None, line.object_id)
         }
-        present = set(self._transaction.scalars(select(Enrollment.id)))
+        present = set(self.transaction.scalars(select(Enrollment.id)))
         if names.keys() <= present:
             return {}
         removals = select(Entry).where(Entry.action.in_((Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)))
-        for line in self._transaction.scalars(removals):
+        for line in self.transaction.scalars(removals):
             collected = (line.record or {}).get(COLLECTED)
             present |= {one for one in collected if isinstance(one, int)} if isinstance(collected, list) else set()
             present |= {line.enrollment_id or 0}

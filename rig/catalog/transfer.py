@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import describing, digests, log
+from rig.catalog import describing, digests
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, digest_of, digested, seal_of, sha256_of
@@ -93,8 +93,7 @@ class CatalogSource:
 
         Raises `ObjectNotFound`: there is no object of one of the names. `CatalogError`: its enrollment is unfinished.
         """
-        with self.catalog.database.read() as transaction:
-            state = State(transaction)
+        with self.catalog.reading() as state:
             used = state.used(checked=True)
             if self.names:
                 named = {known.object_id: known for known in map(state.find, dict.fromkeys(self.names))}
@@ -182,8 +181,8 @@ def transfer(
     # Check all rows, then all images; those of the bench's own catalog are compared with their names when they are
     # stored.
     plan = _Plan(tuple(source.items()))
-    with target.database.read() as transaction:
-        plan = plan.compared(State(transaction), conflict, once=once)
+    with target.reading() as state:
+        plan = plan.compared(state, conflict, once=once)
     enrollments = {item.name: item.enrollment for item in plan.wanted}
     if catalog is not None and catalog.own:
         sizes = {image: size for one in enrollments.values() for image, size in images_of(one)}
@@ -203,8 +202,7 @@ def transfer(
         with target.database.catalog_errors():
             if lost := (yield from store_images(source.content, store, found.images)):
                 raise _rejection(source, lost)
-        with target.database.write() as transaction:
-            state = State(transaction)
+        with target.writing() as state:
             plan = plan.compared(state, conflict, once=once)  # another process may have added objects
             missing = store.missing({name for name, _ in found.images.values()})
             for image, (name, _) in found.images.items():
@@ -214,11 +212,10 @@ def transfer(
                         raise _rejection(source, [content])
                     store.put(content)
             if plan.wanted:
-                new = _add(transaction, state, target.clock, plan, label)
-                details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
-                log.append(
-                    transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)}
-                )
+                new = _add(state, target.clock, plan, label)
+                details: dict[str, Any] = {"origin": source.origin, "objects": plan.names, "views": plan.views}
+                details["replaced"] = list(plan.replaced)
+                state.append(target.clock, Action.IMPORTED, None, details=details)
                 rows = [
                     describing.row_of(seal_of(enrollment), what, content)
                     for name, enrollment in new.items()
@@ -226,7 +223,7 @@ def transfer(
                 ]
                 if once and catalog is not None:
                     rows += _computed(catalog.catalog, new.values())
-                describing.add(transaction, rows)
+                describing.add(state.transaction, rows)
     counts = (len(plan.wanted), plan.views, plan.bytes)
     return Transferred(*counts, plan.skipped, plan.replaced, rejected)
 
@@ -370,26 +367,25 @@ class _Plan:
 # Add
 
 
-def _add(transaction: Transaction, state: State, clock: Clock, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
+def _add(state: State, clock: Clock, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
     """Add the rows of objects, and a line of the log for each enrollment; return the new ones by name."""
     new = {}
     for item in plan.wanted:
         known = plan.named.get(item.name)
-        object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
-        assert object_id is not None
+        object_id = state.id_of(known)
         enrollment, there = item.enrollment, plan.known.get(item.enrollment.key)
         if there is not None and there.enrollment.object_id == object_id and _are_equal(there.enrollment, enrollment):
             enrollment = there.enrollment  # an earlier one of the object: it comes into use again
         else:
             if there is not None:  # with other views, or of an object that is deleted or has another name
                 digest(enrollment, secrets.token_hex(32))
-            new[item.name] = add_rows(transaction, enrollment, object_id)
+            new[item.name] = add_rows(state.transaction, enrollment, object_id)
         if known is not None:
             state.end_current(clock, known, EnrollmentStatus.COMPLETE)
         columns = ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
         if known is None:
             columns |= new_columns(item.created_utc, {"label": item.label or label or "", "note": item.note})
-        log.append(transaction, clock, Action.IMPORTED, item.name, **columns)
+        state.append(clock, Action.IMPORTED, item.name, **columns)
     return new
 
 

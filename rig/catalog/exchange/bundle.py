@@ -25,7 +25,6 @@ from rig.catalog.exchange.new_files import new_file
 from rig.catalog.facts import Enrollment
 from rig.catalog.images import Images, name_of, path_of
 from rig.catalog.jobs import finished
-from rig.catalog.state import State
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.catalog.upkeep import NAMED_IMAGES
 from rig.config.catalog_place import DATABASE_NAME
@@ -218,11 +217,11 @@ def _suspicious(info: ZipInfo) -> str:
 
 def _check_content(path: Path, catalog: Catalog, sizes: Mapping[str, int]) -> None:
     """Check that every enrollment is in use, and that exactly its images are in the bundle, with their stored sizes."""
-    with catalog.database.read() as transaction:
-        if transaction.scalar(select(func.count(Enrollment.id))) != len(State(transaction).used()):
+    with catalog.reading() as state:
+        if state.transaction.scalar(select(func.count(Enrollment.id))) != len(state.used()):
             raise _rejected(path, "it contains an enrollment that is not complete or not in use")
         of_enrollments = select(_IMAGE.image, _IMAGE.image_bytes).where(_IMAGE.enrollment_id.is_not(None))
-        named = {str(name): size for name, size in transaction.execute(of_enrollments)}
+        named = {str(name): size for name, size in state.transaction.execute(of_enrollments)}
     for name, size in named.items():
         if path_of(name) not in sizes:
             raise _rejected(path, f"the image {path_of(name)!r} is missing")
