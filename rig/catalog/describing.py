@@ -194,7 +194,8 @@ def computed(
         view = views[place]
         with _reasons(name, place):
             image = pixels(view.image)
-            levels = {kind: descriptor(kind).describe(within(image, view.region)) for kind in whole}
+            part = within(image, view.region)
+            levels = {kind: descriptor(kind).describe(part) for kind in whole}
             if cut_out:
                 describer, number = learned[place]
                 found = describer.describe(number, image, view.azimuth_deg)

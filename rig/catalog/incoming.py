@@ -64,14 +64,14 @@ _READ_ERRORS: Final = (
 
 @dataclass
 class ReadImages:
-    """What was read: name and size in bytes of each image, or the reason why it cannot be used.
+    """What was read for an object: name and size in bytes of each image, or the reason why it cannot be used.
 
-    ``contents`` are the descriptions by the names of the objects (`describing.computed`).
+    ``contents`` are its description (`describing.computed`), if there is one.
     """
 
     images: dict[str, tuple[str, int]] = field(default_factory=dict)
     rejected: dict[str, RejectedFile] = field(default_factory=dict)
-    contents: dict[str, dict[str, bytes]] = field(default_factory=dict)
+    contents: dict[str, bytes] = field(default_factory=dict)
 
 
 def images_of(enrollment: Enrollment) -> Iterator[tuple[str, int]]:
@@ -90,32 +90,23 @@ def read_images(
     are_named: bool,
     strict: bool,
     jobs: int | None,
-) -> Generator[JobProgress, None, ReadImages]:
-    """Read, decode and describe the images of objects' enrollments, in several processes.
+) -> Generator[JobProgress, None, dict[str, ReadImages]]:
+    """Read, decode and describe the images of objects' enrollments, in several processes; return them by object.
 
     If they ``are_named`` as in a catalog, they are compared with their names. With ``strict`` it ends at the first
     object with a rejected image. A view that the ``descriptors`` cannot describe would stop every later search, so it
     is rejected, too.
     """
     total, done = sum(len(dict(images_of(one))) for one in enrollments.values()), 0
-    found = ReadImages()
+    found: dict[str, ReadImages] = {}
     yield JobProgress(0, total)
-    parts = []
     work = partial(_read, read, are_named, descriptors)
-    for (name, enrollment), part in map_in_processes(work, enrollments.items(), processes(jobs, total)):
-        parts.append((name, part))
-        found.images |= part.images
-        found.rejected |= part.rejected
-        found.contents |= part.contents
-        if strict and found.rejected:
+    for (name, enrollment), own in map_in_processes(work, enrollments.items(), processes(jobs, total)):
+        found[name] = own
+        if strict and own.rejected:
             break
         done += len(dict(images_of(enrollment)))
         yield JobProgress(done, total)
-    for name, part in parts:  # an image that one object cannot use is left out of the others, too
-        if not found.rejected.keys().isdisjoint(part.images):
-            found.contents.pop(name, None)
-    for image in found.rejected:
-        found.images.pop(image, None)
     return found
 
 
@@ -160,32 +151,20 @@ def _read(read: Read, are_named: bool, descriptors: tuple[str, ...], one: tuple[
             except BadImage as error:
                 content = RejectedFile(image, ImportProblem.INVALID_IMAGE, f"cannot be used: {error}")
         found.rejected[image] = content
+    # Describe the views whose images can be used, and reject those that cannot be described with the others.
     pixels = describing.reader(lambda image: decode(read(image)), held)
-    _describe(pixels, name, enrollment, descriptors, found)
-    return found
-
-
-def _describe(
-    pixels: Callable[[str], describing.Pixels],
-    name: str,
-    enrollment: Enrollment,
-    descriptors: tuple[str, ...],
-    found: ReadImages,
-) -> None:
-    """Describe the views whose images can be used, and reject those that cannot be described with the others."""
     tables = [session.empty_table for session in enrollment.sessions]
     while found.rejected.keys().isdisjoint(tables):
         good = Enrollment(key=enrollment.key, object_id=0, started_utc=enrollment.started_utc, planned_azimuth_deg=())
         good.sessions = enrollment.sessions
         good.views = [view for view in enrollment.views if view.image not in found.rejected]
-        if not good.views:
-            return
         try:
-            found.contents[name] = describing.computed(pixels, good, name, descriptors)
-            return
+            found.contents = describing.computed(pixels, good, name, descriptors) if good.views else {}
+            break
         except CatalogError as error:
             if "view" not in error.evidence:
                 raise  # of the store
             image, reason = good.views[error.evidence["view"]].image, error.evidence["reason"]
             found.rejected[image] = RejectedFile(image, ImportProblem.NOT_DESCRIBED, f"cannot be described: {reason}")
             found.images.pop(image, None)
+    return found

@@ -185,27 +185,33 @@ def transfer(
         plan = plan.compared(state, conflict, once=once)
     enrollments = {item.name: item.enrollment for item in plan.wanted}
     if catalog is not None and catalog.own:
-        sizes = {image: size for one in enrollments.values() for image, size in images_of(one)}
-        found = ReadImages({image: (image, size) for image, size in sizes.items()})
+        found = {
+            name: ReadImages({image: (image, size) for image, size in images_of(one)})
+            for name, one in enrollments.items()
+        }
     else:
         options = {"are_named": strict, "strict": strict and not dry_run}
         found = yield from read_images(source.content, enrollments, tuple(descriptors), **options, jobs=jobs)
-    rejected = (*source.rejected, *found.rejected.values())
+    images = {image: known for one in found.values() for image, known in one.images.items()}
+    unusable = {image: file for one in found.values() for image, file in one.rejected.items()}
+    rejected = (*source.rejected, *unusable.values())
+    if strict and rejected:
+        raise _rejection(source, rejected)
     plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=not strict))
     tables = {session.empty_table for one in enrollments.values() for session in one.sessions}
-    if (strict and rejected) or (found.rejected and not plan.wanted) or not tables.isdisjoint(found.rejected):
+    if (unusable and not plan.wanted) or not tables.isdisjoint(unusable):
         raise _rejection(source, rejected)
 
     # Store the images, now that all of them are right. Then add all rows.
     if not dry_run:
         store = target.database.images
         with target.database.catalog_errors():
-            if lost := (yield from store_images(source.content, store, found.images)):
+            if lost := (yield from store_images(source.content, store, images)):
                 raise _rejection(source, lost)
         with target.writing() as state:
             plan = plan.compared(state, conflict, once=once)  # another process may have added objects
-            missing = store.missing({name for name, _ in found.images.values()})
-            for image, (name, _) in found.images.items():
+            missing = store.missing({name for name, _ in images.values()})
+            for image, (name, _) in images.items():
                 if name in missing:  # `collect_garbage` removed it: an object that was deleted had it, too
                     content = checked(source.content, image, name)
                     if isinstance(content, RejectedFile):
@@ -219,7 +225,7 @@ def transfer(
                 rows = [
                     describing.row_of(seal_of(enrollment), what, content)
                     for name, enrollment in new.items()
-                    for what, content in found.contents.get(name, {}).items()
+                    for what, content in found[name].contents.items()
                 ]
                 if once and catalog is not None:
                     rows += _computed(catalog.catalog, new.values())
@@ -243,34 +249,34 @@ def _rejection(source: TransferSource, rejected: Sequence[RejectedFile]) -> RigE
     )
 
 
-def _kept(items: Sequence[TransferItem], found: ReadImages, *, are_photographs: bool) -> tuple[TransferItem, ...]:
+def _kept(
+    items: Sequence[TransferItem], found: Mapping[str, ReadImages], *, are_photographs: bool
+) -> tuple[TransferItem, ...]:
     """Return new rows of objects with the stored images, without the views whose images were rejected."""
-    return tuple(
-        replace(item, enrollment=_new(item.name, item.enrollment, found, is_photographed=are_photographs))
-        for item in items
-        if any(view.image in found.images for view in item.enrollment.views)
-    )
+    new = (replace(one, enrollment=_new(one, found[one.name].images, are_photographs)) for one in items)
+    return tuple(one for one in new if one.enrollment.views)
 
 
-def _new(name: str, old: Enrollment, found: ReadImages, *, is_photographed: bool) -> Enrollment:
+def _new(item: TransferItem, images: Mapping[str, tuple[str, int]], is_photographed: bool) -> Enrollment:
     """Return new rows of an enrollment. Photographs have no key: it is the digest of what they are."""
-    good = [view for view in old.views if view.image in found.images]
+    old = item.enrollment
+    good = [view for view in old.views if view.image in images]
     plan, key = old.planned_azimuth_deg, old.key
     if is_photographed:
         plan = tuple(old.planned_azimuth_deg[view.index] for view in good)
-        tables = [found.images.get(session.empty_table or "") for session in old.sessions]
-        shown = [(view.azimuth_deg, found.images[view.image], view.region) for view in good]
-        key = sha256_of((name, *shown, *([tables] if any(tables) else [])))
+        tables = [images.get(session.empty_table or "") for session in old.sessions]
+        shown = [(view.azimuth_deg, images[view.image], view.region) for view in good]
+        key = sha256_of((item.name, *shown, *([tables] if any(tables) else [])))
     new = Enrollment(key=key, object_id=0, started_utc=old.started_utc, planned_azimuth_deg=plan)
     for session in old.sessions:
         part = same_session(session)
-        if part.empty_table in found.images:
-            part.empty_table, part.empty_table_bytes = found.images[part.empty_table]
+        if (table := images.get(part.empty_table or "")) is not None:
+            part.empty_table, part.empty_table_bytes = table
         new.sessions.append(part)
     for place, view in enumerate(good):
         copy = same_view(view)
         copy.index = place if is_photographed else view.index
-        copy.image, copy.image_bytes = found.images[view.image]
+        copy.image, copy.image_bytes = images[view.image]
         new.views.append(copy)
     digest(new, key)
     return new
