@@ -16,7 +16,7 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
-from rig.catalog.database import Database, open_database
+from rig.catalog.database import Database
 from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
 from rig.catalog.records import MAX_VIEWS, EnrollmentStatus, Provenance, as_json, checked_texts, clean_name, is_plan
@@ -71,7 +71,15 @@ class Catalog(AbstractContextManager["Catalog"]):
         denies access. `CatalogUnavailable`: the server of the catalog does not answer.
         """
         place = CatalogPlace.of(path)
-        return cls(open_database(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
+        if place.url is None:
+            from rig.catalog.sqlite_database import SqliteDatabase
+
+            kind: type[Database] = SqliteDatabase
+        else:
+            from rig.catalog.postgres import PostgresDatabase
+
+            kind = PostgresDatabase
+        return cls(kind(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
 
     def __exit__(self, *_: object) -> None:
         self.close()

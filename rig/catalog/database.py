@@ -87,15 +87,6 @@ class Database(ABC):
         return []
 
 
-def open_database(place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> Database:
-    """Return the database of a catalog with the engine that its place names."""
-    if place.url is None:
-        from rig.catalog.sqlite_database import SqliteDatabase as Kind
-    else:
-        from rig.catalog.postgres import PostgresDatabase as Kind  # type: ignore[assignment] # the package may be missing
-    return Kind(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s)
-
-
 def _transaction(connection: Connection) -> Transaction:
     return Transaction(connection, expire_on_commit=False, autoflush=True)
 

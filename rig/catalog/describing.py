@@ -21,7 +21,7 @@ import hbr
 from hbr.descriptors import Descriptor, descriptor, names
 from hbr.descriptors.network import PACKAGE
 from hbr.kernels.library import THREADS
-from rig.catalog.database import Database, open_database
+from rig.catalog.database import Database
 from rig.catalog.facts import Derived, Enrollment, Session, View, seal_of
 from rig.catalog.images import Images
 from rig.catalog.records import JsonObject, Region
@@ -312,7 +312,7 @@ def store(database: Database, seal: str, contents: Mapping[str, bytes]) -> None:
             _write(database, rows)
             return
         # What is derived may also be added to a catalog that is open for reading.
-        writing = open_database(database.place, create=False, read_only=False, busy_timeout_s=1.0)
+        writing = type(database)(database.place, create=False, read_only=False, busy_timeout_s=1.0)
         try:
             _write(writing, rows)
         finally:
