@@ -10,7 +10,7 @@ one plain backdrop with a visible platter.
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, lru_cache, partial
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome
 from hbr.descriptors.together import ViewsTogether
 from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
-from hbr.evaluation.condition import Condition
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset, PhotographedObject, object_mask, read_photograph, without_specks
 from hbr.evaluation.poses import StatedPose, pose_rates, stated_pose
@@ -90,12 +89,13 @@ class EnrolledViews:
     cut_outs: tuple[LocalView, ...]
 
 
-class _Scene(Protocol):
+class _Scene(NamedTuple):
     """What the camera sees during an enrollment or a search: frames and the empty table, uint8 (H, W, 3)."""
 
-    def empty(self) -> ImageArray: ...
-
-    def frame(self, item: PhotographedObject, place: int) -> ImageArray: ...
+    frame: Callable[[PhotographedObject, int], ImageArray]
+    """Of an object, and the place of the photograph that shows it."""
+    empty: Callable[[], ImageArray] | None = None
+    """None: the photographs as they are, which have no empty table."""
 
 
 def enroll_changed(item: PhotographedObject, experiment: Experiment) -> EnrolledViews:
@@ -108,10 +108,10 @@ def enroll_changed(item: PhotographedObject, experiment: Experiment) -> Enrolled
     """
     scene = _enrollment_scene(experiment)
     places = _enrolled_places(item, experiment)
-    kind, picture = experiment.condition.descriptor, experiment.picture
-    views, empty = ViewsTogether(kind, several=False), Background(scene.empty()) if picture else None
+    views, empty = ViewsTogether(experiment.condition.descriptor, several=False), _empty_table(scene, experiment)
+    table = None if empty is None else Background(empty)
     for place in places:
-        views.learn(scene.frame(item, place), empty)
+        views.learn(scene.frame(item, place), table)
     views.revise()
     azimuths_deg = item.azimuth_deg[places]
     cuts = zip(views.segmentations, azimuths_deg.tolist(), strict=True)
@@ -151,7 +151,15 @@ def search_changed(
             if all(one.is_done for one in both):
                 break
         result = search.result()
-        results.append(result if without is None else _with_left_out(result, without.result()))
+        if without is not None:
+            other = without.result()
+            result = replace(
+                result,
+                left_out=other.outcome,
+                left_out_probability=other.probability,
+                left_out_not_enrolled=other.not_enrolled,
+            )
+        results.append(result)
     return results
 
 
@@ -174,12 +182,13 @@ def searches(item: PhotographedObject, experiment: Experiment) -> Iterator[Searc
     DatasetError
         A photograph cannot be used.
     """
-    before = Background(_enrollment_scene(experiment).empty()) if experiment.picture else None
+    enrolled_empty = _empty_table(_enrollment_scene(experiment), experiment)
+    before = None if enrolled_empty is None else Background(enrolled_empty)
     for trial in range(experiment.protocol.trials):
         rng = generator(experiment.protocol.seed, item.name, "trial", trial)
         scene = _search_scene(experiment, rng)
         places = _query_places(item, experiment, rng.uniform(0, 360) + _VIEWS_DEG)
-        empty = None if before is None else scene.empty()
+        empty = _empty_table(scene, experiment)
         other_bench = before is not None and empty is not None and before.shows_another_bench(empty)
         yield SearchViews(_views_so_far(item, experiment, scene, empty, places), len(places), other_bench)
 
@@ -196,15 +205,6 @@ def _views_so_far(
     for place in places:
         views.add(scene.frame(item, place), table)
         yield views, item.photographs[place].azimuth_deg
-
-
-def _with_left_out(result: SearchResult, other: SearchResult) -> SearchResult:
-    return replace(
-        result,
-        left_out=other.outcome,
-        left_out_probability=other.probability,
-        left_out_not_enrolled=other.not_enrolled,
-    )
 
 
 class _Search:
@@ -331,48 +331,40 @@ def is_enrolled(place: int, experiment: Experiment) -> bool:
     return experiment.change == "none" or (place + 1) % _NEVER_ENROLLED != 0
 
 
-@dataclass(frozen=True)
-class _DrawnScene:
-    """An object that is cut out of its photographs, on a drawn bench."""
+def _drawn_scene(visit: Visit) -> _Scene:
+    """Return an object that is cut out of its photographs, on a drawn bench."""
 
-    visit: Visit
+    def frame(item: PhotographedObject, place: int) -> ImageArray:
+        image = read_photograph(item.photographs[place].path)
+        mask = without_specks(object_mask(image))
+        return visit.photograph(image, mask, item.photographs[place].azimuth_deg).image
 
-    def empty(self) -> ImageArray:
-        return self.visit.empty()
-
-    def frame(self, item: PhotographedObject, place: int) -> ImageArray:
-        return self.visit.photograph(*cut_out(item, place), item.photographs[place].azimuth_deg).image
+    return _Scene(frame, visit.empty)
 
 
-@dataclass(frozen=True)
-class _OwnScene:
-    """The photographs as they are; ``seed`` draws the noise of queries, None: they are enrolled."""
-
-    condition: Condition
-    seed: int | None = None
-
-    def empty(self) -> ImageArray:
-        raise NotImplementedError  # `Experiment` rejects that
-
-    def frame(self, item: PhotographedObject, place: int) -> ImageArray:
-        image = item.photographs[place].read()
-        if self.seed is None:
-            return self.condition.enrolled(image, generator(0, item.name, "enrolled", place))
-        return self.condition.query(image, generator(self.seed, item.name, "photograph", place))
+def _own_scene(experiment: Experiment, seed: int | None = None) -> _Scene:
+    """Return the photographs as they are; ``seed`` draws the noise of queries, None: they are enrolled."""
+    shown = experiment.condition.shown
+    return _Scene(lambda item, place: shown(item.photographs[place].read(), item.name, place, seed))
 
 
 def _enrollment_scene(experiment: Experiment) -> _Scene:
     if experiment.change == "none":
-        return _OwnScene(experiment.condition)
-    return _DrawnScene(Visit(_enrollment_bench(experiment.plain), ENROLLMENT, np.random.default_rng(1)))
+        return _own_scene(experiment)
+    return _drawn_scene(Visit(_enrollment_bench(experiment.plain), ENROLLMENT, np.random.default_rng(1)))
 
 
 def _search_scene(experiment: Experiment, rng: np.random.Generator) -> _Scene:
     if experiment.change == "none":
-        return _OwnScene(experiment.condition, experiment.protocol.seed)
+        return _own_scene(experiment, experiment.protocol.seed)
     hard = experiment.change == "hard"
     bench = _benches(experiment.plain)[int(rng.integers(_BENCHES))] if hard else _enrollment_bench(experiment.plain)
-    return _DrawnScene(Visit(bench, HARD if hard else MILD, rng))
+    return _drawn_scene(Visit(bench, HARD if hard else MILD, rng))
+
+
+def _empty_table(scene: _Scene, experiment: Experiment) -> ImageArray | None:
+    """Return the empty-table image of a scene, None if the experiment uses none."""
+    return scene.empty() if experiment.picture and scene.empty is not None else None
 
 
 def _enrolled_places(item: PhotographedObject, experiment: Experiment) -> list[int]:
@@ -394,11 +386,6 @@ def _query_places(item: PhotographedObject, experiment: Experiment, azimuth_deg:
         )
     left = replace(item, photographs=tuple(item.photographs[place] for place in others))
     return [int(others[place]) for place in nearest_photographs(left, azimuth_deg[: len(others)])]
-
-
-def cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[np.bool_]]:
-    image = read_photograph(item.photographs[place].path)
-    return image, without_specks(object_mask(image))
 
 
 def nearest_photographs(item: PhotographedObject, azimuth_deg: NDArray[np.float64]) -> list[int]:

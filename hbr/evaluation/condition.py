@@ -1,8 +1,7 @@
 """The condition of an experiment: how the images of queries differ from those of enrolled views."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, TypeVar, get_args
+from typing import Any, Final, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -55,9 +54,6 @@ class Condition:
             raise ValueError(f"a rotation of {self.rotation_deg} degrees; 0 to 180 are possible")
         if not (np.isfinite(self.prefilter_px) and self.prefilter_px >= 0):
             raise ValueError(f"a prefilter of {self.prefilter_px} pixels; at least 0 is needed")
-        for name in ("background", "enrolled_background"):
-            if (value := getattr(self, name)) not in get_args(Background):
-                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(get_args(Background))}")
         if self.cut_out and not descriptor(self.descriptor).whole_image:
             raise ValueError(f"{self.descriptor} cuts the object out itself; leave cut_out out")
         if self.perturbations and (self.rotation_deg or self.background != "same"):
@@ -88,6 +84,12 @@ class Condition:
             if self.background != "same":
                 image = _before(image, mask, self.background, rng)
         return self._prefiltered(self.noise.apply(image, rng))
+
+    def shown(self, image_bgr: ImageArray, name: str, number: int, seed: int | None = None) -> ImageArray:
+        """Return a photograph of an object as an enrolled view, or with a ``seed`` as a query."""
+        if seed is None:
+            return self.enrolled(image_bgr, generator(0, name, "enrolled", number))
+        return self.query(image_bgr, generator(seed, name, "photograph", number))
 
     def _sized(self, image_bgr: ImageArray) -> ImageArray:
         height, width = image_bgr.shape[:2]
@@ -134,8 +136,10 @@ def _textured(image: ImageArray, rng: np.random.Generator) -> ImageArray:
     return np.clip(texture, 0, 255).astype(np.uint8)
 
 
-def enrolled_levels(dataset: Dataset, j: int, condition: Condition) -> LevelArray:
+def levels_of(dataset: Dataset, j: int, condition: Condition, seed: int | None = None) -> LevelArray:
     """Return the descriptors of all photographs of object `j` as enrolled views, uint8 (n, length).
+
+    With a ``seed``: as queries, each with its own noise.
 
     Raises
     ------
@@ -143,17 +147,6 @@ def enrolled_levels(dataset: Dataset, j: int, condition: Condition) -> LevelArra
         A photograph cannot be used, or has another size.
     """
     name = dataset.objects[j].name
-    images = ((i, dataset.image(j, i)) for i in range(len(dataset.objects[j].photographs)))
-    return _levels((condition.enrolled(image, generator(0, name, "enrolled", i)) for i, image in images), condition)
-
-
-def query_levels(dataset: Dataset, j: int, condition: Condition, seed: int) -> LevelArray:
-    """Return the descriptors of all views of object `j` as queries. Each has its own noise."""
-    name = dataset.objects[j].name
-    images = ((i, dataset.image(j, i)) for i in range(len(dataset.objects[j].photographs)))
-    return _levels((condition.query(image, generator(seed, name, "photograph", i)) for i, image in images), condition)
-
-
-def _levels(images: Iterable[ImageArray], condition: Condition) -> LevelArray:
-    shown = (segment(image).alone for image in images) if condition.cut_out else images
-    return np.stack([describe(image, descriptor=condition.descriptor) for image in shown])
+    images = (condition.shown(dataset.image(j, i), name, i, seed) for i in range(len(dataset.objects[j].photographs)))
+    seen = (segment(image).alone for image in images) if condition.cut_out else images
+    return np.stack([describe(image, descriptor=condition.descriptor) for image in seen])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, NamedTuple
 
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition
@@ -45,8 +45,6 @@ class Experiment:
     """Lead per view, and number of views, that end a search of the paper."""
 
     def __post_init__(self) -> None:
-        if self.change is not None and self.change not in get_args(Change):
-            raise ValueError(f"change {self.change!r} is unknown; use none, mild or hard")
         if self.change == "none" and self.picture:
             raise ValueError("photographs as they are have no empty-table image; give picture = false")
         if self.every < 1:

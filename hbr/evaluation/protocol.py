@@ -4,7 +4,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from hbr.dense.index import OMEGA, DenseIndex
 from hbr.dense.stopping import Outcome
 from hbr.model.views import Views
 from hbr.paper.hough import Extension
-from hbr.paper.index import Method as IndexMethod
 
 Removal = Literal["near", "paper79", "queries"]
 #: Codes of `Runs.outcome`.
@@ -168,14 +167,10 @@ class Protocol:
     views are enrolled, including the queries."""
     absent: tuple[str, ...] = ()
     """Names of objects that are not enrolled, to measure unknown objects; only with the dense filter."""
-    index: IndexMethod = "flat"
-    """Search for similar views (`hbr.ViewIndex`) in the first trial of each object, whose time is measured."""
 
     def __post_init__(self) -> None:
         if self.trials < 1 or self.max_views < 1:
             raise ValueError(f"{self.trials} trials of {self.max_views} views; at least one of each is needed")
-        if self.removal not in get_args(Removal):
-            raise ValueError(f"removal {self.removal!r} is unknown; use one of {', '.join(get_args(Removal))}")
         if not (0 < self.near_deg <= 180 and 0 <= self.sigma_deg < np.inf and np.isfinite(self.drift_deg)):
             raise ValueError(
                 f"near_deg is {self.near_deg}, sigma_deg {self.sigma_deg}, drift_deg {self.drift_deg}; needed are a "
@@ -183,8 +178,6 @@ class Protocol:
             )
         if not np.isfinite(self.rotation_errors_deg).all():
             raise ValueError("an error of a rotation is not a finite number; correct the file of the errors")
-        if self.index not in get_args(IndexMethod):
-            raise ValueError(f"index {self.index!r} is unknown; use one of {', '.join(get_args(IndexMethod))}")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; a whole number of at least 0 is needed")
         if self.enrolled is not None and self.enrolled < 1:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
-from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import BETA, Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
@@ -22,7 +22,7 @@ from hbr.dense.pose import azimuth_of, pose
 from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome
 from hbr.descriptors import descriptor
-from hbr.evaluation.condition import Condition, enrolled_levels, query_levels
+from hbr.evaluation.condition import Condition, levels_of
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.poses import stated_pose
@@ -30,7 +30,7 @@ from hbr.evaluation.protocol import OUTCOMES, Method, Protocol, Runs, generator,
 from hbr.evaluation.results import results_of
 from hbr.model.symmetry import symmetry
 from hbr.model.views import Views
-from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
+from hbr.paper.hmm import CONFIDENT, PoseModel, update_poses
 from hbr.paper.hough import Ranking, retrieve
 from hbr.paper.index import ViewIndex, largest
 from hbr.paper.next_view import Side, next_view
@@ -73,7 +73,7 @@ class Searched(NamedTuple):
 class LocalPhotographs:
     """The photographs of a data set, cut out when a search asks for them (`hbr.dense.session`).
 
-    ``seed`` is that of the queries, as for `hbr.evaluation.condition.query_levels`.
+    ``seed`` is that of the queries, as for `hbr.evaluation.condition.levels_of`.
     """
 
     def __init__(self, dataset: Dataset, condition: Condition, seed: int) -> None:
@@ -87,28 +87,22 @@ class LocalPhotographs:
 
     def query(self, object_index: int, number: int, azimuth_deg: float) -> LocalView:
         """Return a photograph of an object, counted from 0, as a view of a search at this orientation."""
-        name = self._dataset.objects[object_index].name
-        rng = generator(self._seed, name, "photograph", number)
-        image = self._dataset.image(object_index, number)
-        return _local_view(self._condition.query(image, rng), azimuth_deg)
+        return self._local_view(object_index, number, azimuth_deg, self._seed)
 
     def enrolled(self, object_index: int, numbers: IndexArray, azimuths_deg: Sequence[float]) -> list[LocalView]:
         """Return the enrolled views nearest to each azimuth, of the photographs with these numbers, by azimuth."""
-        own_deg = self._dataset.objects[object_index].azimuth_deg[numbers]
-        return [self._enrolled(object_index, number) for number in numbers[near(own_deg, azimuths_deg)].tolist()]
+        own_deg = self._dataset.objects[object_index].azimuth_deg
+        chosen = numbers[near(own_deg[numbers], azimuths_deg)].tolist()
+        for number in chosen:
+            if (object_index, number) not in self._known:
+                view = self._local_view(object_index, number, float(own_deg[number]))
+                self._known[object_index, number] = view
+        return [self._known[object_index, number] for number in chosen]
 
-    def _enrolled(self, object_index: int, number: int) -> LocalView:
-        if (object_index, number) not in self._known:
-            item = self._dataset.objects[object_index]
-            image = self._dataset.image(object_index, number)
-            shown = self._condition.enrolled(image, generator(0, item.name, "enrolled", number))
-            self._known[object_index, number] = _local_view(shown, item.photographs[number].azimuth_deg)
-        return self._known[object_index, number]
-
-
-def _local_view(image: ImageArray, azimuth_deg: float) -> LocalView:
-    cut = segment(image)
-    return LocalView(cut.crop, cut.mask, azimuth_deg)
+    def _local_view(self, j: int, number: int, azimuth_deg: float, seed: int | None = None) -> LocalView:
+        image, name = self._dataset.image(j, number), self._dataset.objects[j].name
+        cut = segment(self._condition.shown(image, name, number, seed))
+        return LocalView(cut.crop, cut.mask, azimuth_deg)
 
 
 def run_object(
@@ -121,25 +115,11 @@ def run_object(
     photographs: LocalPhotographs | None = None,
     now_ns: Callable[[], int] = lambda: 0,
 ) -> Runs:
-    """Search for one object with all methods, in all trials, and return the runs of this object.
+    """Search for one object of ``views`` with all methods, in all trials, and return the runs of this object.
 
-    Parameters
-    ----------
-    object_index : int
-        The object.
-    queries : uint8 array (n, 144)
-        Descriptors of its photographs as queries, one for each of its views, in the order of `views.of`.
-    views : Views
-        The complete model set.
-    methods : sequence of Method
-        The methods of the search.
-    protocol : Protocol
-        The settings of the trials.
-    photographs : LocalPhotographs, optional
-        The images, with which a search of the dense filter compares its two leaders as on the bench. Without them it
-        keeps its answer.
-    now_ns : callable
-        Monotonic time, for `Runs.step_ns`.
+    ``queries``, uint8 (n, length), are its photographs as queries, one for each of its views, in the order of
+    `views.of`. With ``photographs``, a search of the dense filter compares its two leaders as on the bench; without
+    them it keeps its answer. ``now_ns`` is a monotonic time, for `Runs.step_ns`.
 
     Raises
     ------
@@ -224,9 +204,7 @@ class _Trials:
             model = self._model(keep, models)
             # Only the first repetition is timed; the others may share lists.
             is_measured = at[2] == 0
-            index = ViewIndex(model.views, self._protocol.index if is_measured else "flat")
-            if is_measured and self._protocol.index == "tree":
-                index.build()
+            index = ViewIndex(model.views)
             if not is_measured:
                 self._share_lists(index, model, seen, method.list_length)
             start_ns = self._now_ns()
@@ -238,7 +216,8 @@ class _Trials:
                 list_length=method.list_length,
                 extension=method.extension,
             )
-            following = self._next(method, draws, seen, ranking) if n + 1 < last else seen[-1]
+            planned_deg = self._planned_deg(method, draws, seen, ranking) if n + 1 < last else None
+            following = self._next(draws, seen, planned_deg, last)
             runs.step_ns[*at, n] = self._now_ns() - start_ns if is_measured else 0
             self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
             self._record_margin(ranking, seen, keep, runs, (*at, n))
@@ -285,7 +264,9 @@ class _Trials:
             belief = update_poses(similar[0], measured_deg[0], model)
             for i in range(1, n + 1):
                 belief = update_poses(similar[i], measured_deg[i], belief)
-            following = self._next_pose(method, draws, seen, belief) if n + 1 < last else seen[-1]
+            is_planned = method.strategy == "least-risk" and n + 1 < last
+            planned_deg = belief.next_view().rotation_deg if is_planned else None
+            following = self._next(draws, seen, planned_deg, last)
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             objects, log_probability, pose_deg = belief.ranking()
             self._record(objects, pose_deg, seen, runs, (*at, n))
@@ -294,11 +275,6 @@ class _Trials:
             runs.margin[*at, n] = leading[0] - leading[1:].sum()
             runs.outcome[*at, n] = OUTCOMES.index(Outcome.FOUND if leading[0] >= CONFIDENT else Outcome.CONTINUE)
             seen.append(following)
-
-    def _next_pose(self, method: Method, draws: _Draws, seen: list[int], belief: PoseBelief) -> int:
-        if method.strategy == "least-risk":
-            return self._nearest(seen, belief.next_view().rotation_deg)
-        return int(draws.order[len(seen)])
 
     def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
         index = _index_of_trial(self._views, self._protocol, method.omega)
@@ -317,7 +293,8 @@ class _Trials:
             start_ns = self._now_ns()
             newest = seen[-1]
             session.add(self._queries[newest], measured_deg[-1])
-            following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
+            planned_deg = self._planned_dense_deg(method, draws, seen, session) if n + 1 < last else None
+            following = self._next(draws, seen, planned_deg, last)
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
             objects = ranking.object_index.tolist()
@@ -354,31 +331,28 @@ class _Trials:
 
         answered(session.verify(queries), enrolled)
 
-    def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
+    def _planned_dense_deg(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> float | None:
         match method.strategy:
             case "next-best-view":
-                return self._nearest(seen, session.next_best_view().rotation_deg)
+                return session.next_best_view().rotation_deg
             case "next-best-view-coin":
                 rotation_deg = abs(session.next_best_view().rotation_deg)
-                return self._nearest(seen, rotation_deg if draws.coins[len(seen)] else -rotation_deg)
+                return rotation_deg if draws.coins[len(seen)] else -rotation_deg
             case "mutual":
-                return self._nearest(seen, most_informative_rotation(session.belief))
+                return most_informative_rotation(session.belief)
             case "oracle":
-                return self._oracle(seen, session.belief)
-            case _:
-                if method.strategy in _STEP_DEG:
-                    return self._nearest(seen, _STEP_DEG[method.strategy])
-                return int(draws.order[len(seen)])
+                return self._oracle_deg(seen, session.belief)
+        return _STEP_DEG.get(method.strategy)
 
-    def _oracle(self, seen: list[int], belief: Belief) -> int:
-        """Return the photograph with the largest lead of the true object, of every third photograph."""
+    def _oracle_deg(self, seen: list[int], belief: Belief) -> float:
+        """Return the way to the photograph with the largest lead of the true object, of every third photograph."""
         left = np.setdiff1d(self._free, seen)[::3]
         margins = []
         for i in left.tolist():
             scores = update_belief(self._queries[i], float(self._azimuth_deg[i]), belief).scores()
             own = belief.index.object_index == self._object
             margins.append(scores[own].max(initial=-np.inf) - scores[~own].max(initial=-np.inf))
-        return int(left[int(np.argmax(margins))])
+        return float(self._azimuth_deg[left[int(np.argmax(margins))]] - self._azimuth_deg[seen[-1]])
 
     def _keep(self, seen: IndexArray) -> NDArray[np.bool_]:
         """Return which of the object's views stay enrolled after these queries, bool (n,)."""
@@ -409,20 +383,22 @@ class _Trials:
             models[key] = _Model(self._views.select(mask), mask, np.flatnonzero(~mask))
         return models[key]
 
-    def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
-        """Return the next query: a photograph that was not a query yet."""
+    def _planned_deg(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> float | None:
         if method.active and len(seen) > 1:
             coin: Side = "left" if draws.coins[len(seen)] else "right"
             side = coin if method.strategy == "coin" else None
-            rotation_deg = next_view(ranking, side=side, sectors=method.sectors).rotation_deg
-        elif method.strategy in _STEP_DEG:
-            rotation_deg = _STEP_DEG[method.strategy]
-        else:
-            return int(draws.order[len(seen)])
-        return self._nearest(seen, rotation_deg)
+            return next_view(ranking, side=side, sectors=method.sectors).rotation_deg
+        return _STEP_DEG.get(method.strategy)
 
-    def _nearest(self, seen: list[int], rotation_deg: float) -> int:
-        """Return the possible query that is nearest to a rotation from the last one."""
+    def _next(self, draws: _Draws, seen: list[int], rotation_deg: float | None, last: int) -> int:
+        """Return the next query: the possible one nearest to a rotation from the last one, or None: a random one.
+
+        After the ``last`` query of a trial it is that query again.
+        """
+        if len(seen) == last:
+            return seen[-1]
+        if rotation_deg is None:
+            return int(draws.order[len(seen)])
         away_deg = np.full(len(self._rows), np.inf)
         wanted_deg = self._azimuth_deg[seen[-1]] + rotation_deg
         away_deg[self._free] = np.abs(wrap180(self._azimuth_deg[self._free] - wanted_deg))
@@ -490,7 +466,7 @@ def most_informative_rotation(belief: Belief) -> float:
 
 def enroll(experiment: Experiment, dataset: Dataset, j: int) -> LevelArray:
     """Describe all photographs of object `j` as enrolled views."""
-    return enrolled_levels(dataset, j, experiment.condition)
+    return levels_of(dataset, j, experiment.condition)
 
 
 def all_views(experiment: Experiment, dataset: Dataset, enrolled: list[LevelArray]) -> Views:
@@ -503,7 +479,7 @@ def all_views(experiment: Experiment, dataset: Dataset, enrolled: list[LevelArra
 def _search(experiment: Experiment, dataset: Dataset, views: Views, now_ns: Callable[[], int], j: int) -> Searched:
     condition, protocol = experiment.condition, experiment.protocol
     began_ns = now_ns()
-    queries = query_levels(dataset, j, condition, protocol.seed)
+    queries = levels_of(dataset, j, condition, protocol.seed)
     describe_ns = (now_ns() - began_ns) / len(queries)
     photographs = LocalPhotographs(dataset, condition, protocol.seed)
     runs = run_object(

@@ -6,10 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from hbr.evaluation.results import Contest
+from hbr.evaluation.results import Row
 from rig.core.phrases import percent, signed
-
-Row = dict[str, Any]
 
 
 class Rows(NamedTuple):
@@ -171,23 +169,22 @@ def cost_sentence(results: Mapping[str, Any]) -> str | None:
 def contest_sentences(results: Mapping[str, Any]) -> list[str]:
     """Return each comparison of two methods in words, with its interval and p-value."""
     labels = {method["name"]: method["label"] for method in results.get("methods", ())}
-    return [_sentence(Contest(**contest), labels) for contest in results.get("contests", ())]
+    return [_sentence(contest, labels) for contest in results.get("contests", ())]
 
 
-def _sentence(contest: Contest, labels: dict[str, str]) -> str:
-    first = f"{labels[contest.first]} at N = {contest.first_views}"
-    second = f"{labels[contest.second]} at N = {contest.second_views}"
-    if contest.difference_low > 0 and contest.p_value < 0.05:
+def _sentence(contest: Row, labels: dict[str, str]) -> str:
+    first, second = (f"{labels[contest[one]]} at N = {contest[f'{one}_views']}" for one in ("first", "second"))
+    if contest["difference_low"] > 0 and contest["p_value"] < 0.05:
         result = "better"
-    elif contest.difference_high < 0 and contest.p_value < 0.05:
+    elif contest["difference_high"] < 0 and contest["p_value"] < 0.05:
         result = "worse"
     else:
         result = "no difference shown"
+    points, low, high = (signed(100 * contest[f"difference{end}"], 1) for end in ("", "_low", "_high"))
     return (
-        f"{first} ({percent(contest.first_rate)}) against {second} ({percent(contest.second_rate)}): "
-        f"{signed(100 * contest.difference, 1)} points "
-        f"[{signed(100 * contest.difference_low, 1)}, {signed(100 * contest.difference_high, 1)}], "
-        f"McNemar p = {contest.p_value:.2g} ({contest.only_first} trials to {contest.only_second}); {result}"
+        f"{first} ({percent(contest['first_rate'])}) against {second} ({percent(contest['second_rate'])}): "
+        f"{points} points [{low}, {high}], "
+        f"McNemar p = {contest['p_value']:.2g} ({contest['only_first']} trials to {contest['only_second']}); {result}"
     )
 
 

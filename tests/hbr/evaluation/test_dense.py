@@ -21,8 +21,13 @@ def run(name: str, j: int = 2, protocol: Protocol = PROTOCOL) -> Runs:
     return run_object(j, QUERIES[VIEWS.of(j)], VIEWS, choose_methods(name.split(",")), protocol)
 
 
-@pytest.mark.parametrize("protocol", [PROTOCOL, Protocol(trials=2, max_views=4, near_deg=20)])
-@pytest.mark.parametrize("name", ["dense", "dense-90", "dense-random", "dense-coin"])
+@pytest.mark.parametrize(
+    ("name", "protocol"),
+    [
+        *((name, PROTOCOL) for name in ("dense", "dense-90", "dense-random", "dense-coin")),
+        ("dense", Protocol(trials=2, max_views=4, near_deg=20)),
+    ],
+)
 def test_trial_equals_the_literal_protocol(name: str, protocol: Protocol) -> None:
     j = 2
     own = VIEWS.of(j)
@@ -66,7 +71,8 @@ def test_queries_are_views_that_are_not_enrolled() -> None:
     trials = _Trials(1, QUERIES[VIEWS.of(1)], VIEWS, PROTOCOL, lambda: 0)
     for t in range(20):
         assert (trials.draw(t).order % 3 != 0).all()
-    assert (np.array([trials._nearest([1], rotation) for rotation in np.arange(0, 360, 7.0)]) % 3 != 0).all()
+    following = [trials._next(trials.draw(0), [1], rotation, 4) for rotation in np.arange(0, 360, 7.0)]
+    assert (np.array(following) % 3 != 0).all()
     with pytest.raises(ValueError, match="16 views; for 16 queries"):
         run("dense-90", protocol=replace(PROTOCOL, max_views=16))
 
@@ -103,13 +109,12 @@ def test_dense_searches_end_by_the_stopping_rule_and_methods_are_compared() -> N
     runs.outcome[0] = [OUTCOMES.index(Outcome.CONTINUE)] * 2 + [OUTCOMES.index(Outcome.FOUND)] * 2
     runs.outcome[0, 0, :, 2:] = OUTCOMES.index(Outcome.UNKNOWN)
     runs.outcome[0, 1, :, 2:] = OUTCOMES.index(Outcome.AMBIGUOUS)  # the right object leads, but was not found
-    stopping = method_results(runs, methods, margin=10.0)[0].stopping
-    assert (stopping.views_mean, stopping.ended_early) == (3, 1.0)
-    assert (stopping.hit_rate, stopping.unknown_rate) == (pytest.approx(4 / 6), pytest.approx(1 / 6))
-    assert stopping.ambiguous_rate == pytest.approx(1 / 6)
-    assert stopping.wrong_rate == 0
+    stopping = method_results(runs, methods, margin=10.0)[0]["stopping"]
+    assert (stopping["views_mean"], stopping["ended_early"]) == (3, 1.0)
+    rates = [stopping[f"{name}_rate"] for name in ("hit", "unknown", "ambiguous", "wrong")]
+    assert rates == pytest.approx([4 / 6, 1 / 6, 1 / 6, 0])
     runs.named[0, 2, 0, 2] = False  # the ranking does not count: the fit of the pixels may name another object
-    assert method_results(runs, methods, margin=10.0)[0].stopping.wrong_rate == pytest.approx(1 / 18)
-    assert method_results(runs, methods, margin=10.0)[3].stopping.views_mean == 4
-    asked = {(c.first, c.first_views, c.second) for c in contests(runs, methods, np.random.default_rng(0))}
+    assert method_results(runs, methods, margin=10.0)[0]["stopping"]["wrong_rate"] == pytest.approx(1 / 18)
+    assert method_results(runs, methods, margin=10.0)[3]["stopping"]["views_mean"] == 4
+    asked = {(c["first"], c["first_views"], c["second"]) for c in contests(runs, methods, np.random.default_rng(0))}
     assert {("dense", 3, "dense-90"), ("dense", 2, "dense-mutual")} <= asked

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hbr.evaluation.condition import Condition, enrolled_levels, query_levels
+from hbr.evaluation.condition import Condition, levels_of
 from hbr.evaluation.photographs import load_coil
 from hbr.evaluation.protocol import METHODS, Protocol
 from hbr.evaluation.trials import LocalPhotographs, run_object
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_views_are_compared_with_both_near_twins(folder: Path) -> None:
     dataset, condition = load_coil(folder), Condition(descriptor="edges+colours+cedd")
-    levels = [enrolled_levels(dataset, j, condition) for j in range(3)]
+    levels = [levels_of(dataset, j, condition) for j in range(3)]
     views = Views.concatenate(
         [
             Views.of_object(item.name, own, item.azimuth_deg, condition.descriptor)
@@ -50,7 +50,7 @@ def test_views_are_compared_with_both_near_twins(folder: Path) -> None:
     photographs = LocalPhotographs(dataset, condition, protocol.seed)
     assert photographs.possible
     assert not LocalPhotographs(dataset, Condition(), 0).possible  # plain CEDD cuts nothing out
-    queries = query_levels(dataset, 1, condition, protocol.seed)
+    queries = levels_of(dataset, 1, condition, protocol.seed)
     runs = run_object(1, queries, views, [METHODS["dense-90"]], protocol, photographs=photographs)
     assert runs.named[0, 0, 0, -1]
     assert {object_index for object_index, _ in photographs._known} >= {0, 1}  # enrolled views of both twins

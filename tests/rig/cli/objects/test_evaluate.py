@@ -125,7 +125,6 @@ def test_report_of_some_objects_searches_among_all(photographs: Path, evaluated:
         ('base = "nothing"', "base 'nothing' is unknown"),
         ("trials =", "cannot be read"),
         ('descriptor = "sift"', "'sift' is unknown"),
-        ('index = "tree"\ndescriptor = "edges"\nmethods = "hbr"', "the tree compares plain CEDD"),
         ('methods = "dense"\nenrolled = 12', "queries it needs more"),
         ('change = "mild"', "number of enrolled views"),
     ],
