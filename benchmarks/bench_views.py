@@ -20,7 +20,7 @@ from hbr import Background, Segmentation, ViewsTogether, descriptor, segment
 from hbr.core.arrays import ImageArray
 from hbr.drawing.bench import HARD, DrawnBench, Visit
 from hbr.segmentation import BoxMethod
-from hbr.segmentation.background import shrunk
+from hbr.segmentation.background import SegmentedFrame, shrunk
 from hbr.segmentation.silhouette import guess_object, shares
 
 DESCRIPTORS = ("cedd", "edges+colours+cedd")
@@ -69,7 +69,7 @@ def one_view(size: tuple[int, int]) -> None:
         "- describe, cedd and edges+colours+cedd": (lambda: described(replace(found)), 200),
         "whole view, guessed": (lambda: described(segment(image)), 30),
         "- guess": (lambda: guess_object(small), 30),
-        "network": (lambda: shares(small), 30),
+        "network": (lambda: shares(SegmentedFrame(image)), 30),
     }
     for name, (work, repeats) in parts.items():
         record(f"{size[0]}x{size[1]}: {name}", min(times_ms(work, repeats, thread_time)), "cv2.resize to 80 x 80", peer)

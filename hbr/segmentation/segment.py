@@ -189,7 +189,7 @@ def hypotheses(
         if seen is None or not seen.still:
             method, seen = BoxMethod.NETWORK, None
     rotated = method is BoxMethod.ROTATION
-    share, platter = shares(frame.small, seen)
+    share, platter = shares(frame, seen)
     if seen is not None and method is BoxMethod.EMPTY_TABLE:
         # a shadow never makes the table brighter: a thin handle of which the network sees a trace is part of the object
         share = np.where(seen.certain & (seen.evenly > _BRIGHTER) & (share > _TRACE), np.float32(1), share)
@@ -255,7 +255,7 @@ def _cut_out(found: Segmentation | Found) -> Segmentation:
 
 def _alone(frame: SegmentedFrame, like: Found) -> list[Found]:
     """Return the network's silhouette of a frame whose background is not known, with the evidence of another one."""
-    masks = _masks(shares(frame.small).object, (_LEVEL,))
+    masks = _masks(shares(frame).object, (_LEVEL,))
     return [replace(like, silhouette=mask, method=BoxMethod.NETWORK) for mask in masks]
 
 

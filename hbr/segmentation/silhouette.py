@@ -11,6 +11,7 @@ Decision: docs/decisions/0013.
 
 from functools import cache, lru_cache
 from importlib.resources import files
+from io import BytesIO
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -18,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.core.nets import Floats, SharedNet
-from hbr.segmentation.background import LEAST, Difference, Mask, from_border
+from hbr.kernels.nets import Floats, Net, SharedNet
+from hbr.segmentation.background import LEAST, Difference, Mask, SegmentedFrame
 
 Binary = NDArray[np.uint8]
 
@@ -230,45 +231,43 @@ class Shares(NamedTuple):
     platter: Floats
 
 
-def shares(small: ImageArray, difference: Difference | None = None) -> Shares:
-    """Return where a small frame, as `hbr.segmentation.background.shrunk` returns it, shows the object and the platter.
+def shares(frame: SegmentedFrame, difference: Difference | None = None) -> Shares:
+    """Return where the small image of a frame shows the object and the platter.
 
     ``difference`` is the frame's from its background, if that is known.
     """
-    height, width = small.shape[:2]
-    logits = _interleaved(_NETWORK(_planes(small, difference)))
-    found = [1 / (1 + cv2.exp(-plane)) for plane in logits[0]]
+    height, width = frame.small.shape[:2]
+    logits = _interleaved(_NETWORK(_planes(frame, difference)))
+    found = [1 / (1 + cv2.exp(-plane)) for plane in logits]
     if (height, width) != (HEIGHT, WIDTH):
         found = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in found]
     return Shares(*(np.asarray(share, np.float32) for share in found))
 
 
 def _interleaved(fourfold: Floats) -> Floats:
-    """Return the planes (1, n, 2 h, 2 w), of whose pixels the network computes each fourth one: (1, 4 n, h, w).
+    """Return the planes (n, 2 h, 2 w), of whose pixels the network computes each fourth one: (h, w, 4 n).
 
-    The last layer is a convolution: OpenCV takes three times as long for the transposed one that was trained.
+    The last layer is a convolution: a transposed one, as it was trained, takes three times as long.
     """
-    _, planes, height, width = fourfold.shape
-    apart = fourfold.reshape(planes // 4, 2, 2, height, width)
-    return apart.transpose(0, 3, 1, 4, 2).reshape(1, planes // 4, 2 * height, 2 * width)
+    height, width, planes = fourfold.shape
+    apart = fourfold.reshape(height, width, planes // 4, 2, 2)
+    return apart.transpose(2, 0, 3, 1, 4).reshape(planes // 4, 2 * height, 2 * width)
 
 
-def _planes(small: ImageArray, difference: Difference | None) -> Floats:
-    """Return the network's input, float32 (1, 13, HEIGHT, WIDTH)."""
-    planes = np.zeros((1, 13, HEIGHT, WIDTH), np.float32)
-    planes[0, :3] = _sized(small).transpose(2, 0, 1)
-    planes[0, :3] *= np.float32(1 / 255)
-    planes[0, :3] -= np.float32(0.5)
-    planes[0, 3:5] = _places()
-    planes[0, 5] = np.minimum(_sized(from_border(small)) * np.float32(1 / _FROM_BORDER), 1)
+def _planes(frame: SegmentedFrame, difference: Difference | None) -> Floats:
+    """Return the network's input, float32 (HEIGHT, WIDTH, 13)."""
+    planes = np.zeros((HEIGHT, WIDTH, 13), np.float32)
+    planes[..., :3] = _sized(frame.small) * np.float32(1 / 255) - np.float32(0.5)
+    planes[..., 3:5] = _places()
+    planes[..., 5] = np.minimum(_sized(frame.from_border) * np.float32(1 / _FROM_BORDER), 1)
     if difference is not None:
         background = difference.background
-        planes[0, 6] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
-        planes[0, 7] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
-        planes[0, 8] = np.minimum(_sized(background.spread) * np.float32(1 / _SPREAD_SCALE), 1)
-        for plane, compared in zip(planes[0, 9:12], background.view_differences(difference), strict=True):
-            plane[:] = _sized(compared)
-        planes[0, 12] = _OF_A_VIEW * background.views or 1.0
+        planes[..., 6] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
+        planes[..., 7] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
+        planes[..., 8] = np.minimum(_sized(background.spread) * np.float32(1 / _SPREAD_SCALE), 1)
+        for plane, compared in enumerate(background.view_differences(difference), 9):
+            planes[..., plane] = _sized(compared)
+        planes[..., 12] = _OF_A_VIEW * background.views or 1.0
     return planes
 
 
@@ -282,11 +281,34 @@ def _sized(plane: NDArray[Any]) -> NDArray[Any]:
 def _places() -> Floats:
     """Return each pixel's place from -1 to 1: across, and down."""
     y, x = np.meshgrid(np.linspace(-1, 1, HEIGHT), np.linspace(-1, 1, WIDTH), indexing="ij")
-    return np.stack([x, y]).astype(np.float32)
+    return np.stack([x, y], axis=-1).astype(np.float32)
 
 
-def _weights() -> bytes:
-    return files("hbr.segmentation").joinpath("network.onnx").read_bytes()
+def _network() -> Net:
+    """Return the network: an encoder, and a decoder that adds what the encoder found at the same size."""
+    with np.load(BytesIO(files("hbr.segmentation").joinpath("network.npz").read_bytes())) as stored:
+        weights = dict(stored)
+    net = Net(HEIGHT, WIDTH, 13)
+
+    def layer(image: Floats, name: str, stride: int = 1, dilation: int = 1) -> Floats:
+        own = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        return net.convolve(image, *own, stride=stride, dilation=dilation, low=0.0)
+
+    def doubled(image: Floats, name: str, added: Floats) -> Floats:
+        return net.double(image, weights[f"{name}.weight"], weights[f"{name}.bias"], added)
+
+    half = layer(net.input, "first", 2)
+    quarter = layer(layer(half, "quarter.0", 2), "quarter.1")
+    eighth = layer(layer(quarter, "eighth.0", 2), "eighth.1")
+    deep = layer(layer(layer(eighth, "deep.0", 2), "deep.1"), "deep.2", dilation=2)
+    eighth = layer(doubled(deep, "up_eighth", eighth), "to_eighth")
+    quarter = layer(doubled(eighth, "up_quarter", quarter), "to_quarter")
+    half = layer(doubled(quarter, "up_half", half), "to_half")
+    # four pixels of the whole size in each pixel of half the size
+    whole = net.convolve(net.input, weights["full.weight"], weights["full.bias"], stride=2, before=0)
+    whole = net.convolve(half, weights["up.weight"], weights["up.bias"], added=whole, low=0.0)
+    net.convolve(whole, weights["out.weight"], weights["out.bias"])
+    return net
 
 
-_NETWORK: Final = SharedNet(_weights)
+_NETWORK: Final = SharedNet(_network)

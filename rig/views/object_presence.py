@@ -137,7 +137,7 @@ def probability_of_nothing(
     for frame, other in ((first, rotated), (rotated, first)):
         learned = Background.learned([other.small], other.image.shape[:2])
         for difference in (None, learned.difference(frame.small)):
-            highest = max(highest, float(shares(frame.small, difference).object.max()))
+            highest = max(highest, float(shares(frame, difference).object.max()))
     return highest if highest <= MOST_PROBABLE else None
 
 

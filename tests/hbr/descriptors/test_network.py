@@ -15,9 +15,9 @@ import pytest
 from numpy.typing import NDArray
 
 import hbr
-from hbr.core.nets import SharedNet
 from hbr.descriptors import descriptor, network
-from hbr.descriptors.network import Block, graph, tensors
+from hbr.descriptors.network import Block, net, tensors
+from hbr.kernels.nets import SharedNet
 
 installed = pytest.mark.skipif(not descriptor("network").can_describe, reason="pip install 'hbr-rig[network]'")
 
@@ -100,7 +100,7 @@ def test_file_with_anything_but_tensors_is_an_error(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-TINY = (Block(1, 4, 1, 3), Block(2, 5, 3, 3), Block(1, 5, 3, 5))
+TINY = (Block(1, 8, 1, 3), Block(2, 16, 3, 3), Block(1, 16, 3, 5))
 
 
 def tiny() -> dict[str, NDArray[Any]]:
@@ -113,8 +113,8 @@ def tiny() -> dict[str, NDArray[Any]]:
         for kind in ("weight", "bias", "running_mean", "running_var"):
             found[f"{norm}.{kind}"] = rng.uniform(0.3, 1.5, out).astype(np.float32)
 
-    layer("_conv_stem", "_bn0", 6, 3, 3)
-    channels = 6
+    layer("_conv_stem", "_bn0", 8, 3, 3)
+    channels = 8
     for number, block in enumerate(TINY):
         part, inside = f"_blocks.{number}.", channels * block.factor
         if block.factor > 1:
@@ -148,17 +148,17 @@ def by_numpy(weights: dict[str, NDArray[Any]], image: NDArray[np.float64]) -> ND
     return x
 
 
-def test_graph_computes_what_the_layers_say() -> None:
-    weights, image = tiny(), np.random.default_rng(4).normal(0, 1, (3, 20, 20))
-    found = SharedNet(lambda: graph(weights, TINY, 20))(image[None].astype(np.float32))
-    assert found.shape == (1, 5, 5, 5)
-    np.testing.assert_allclose(found[0], by_numpy(weights, image), atol=1e-4)
+def test_net_computes_what_the_layers_say() -> None:
+    weights, image = tiny(), np.random.default_rng(4).normal(0, 1, (20, 20, 3))
+    found = net(weights, TINY, 20)(image)
+    assert found.shape == (5, 5, 16)
+    np.testing.assert_allclose(found.transpose(2, 0, 1), by_numpy(weights, image.transpose(2, 0, 1)), atol=1e-4)
 
 
 @pytest.fixture
 def without_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network, "weights_file", lambda: None)
-    monkeypatch.setattr(network, "_NET", SharedNet(network._onnx.__wrapped__))
+    monkeypatch.setattr(network, "_NET", SharedNet(network._frozen))
 
 
 @pytest.mark.usefixtures("without_weights")
@@ -175,22 +175,22 @@ def test_other_weights_are_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     (tmp_path / "other.pth").write_bytes(b"other")
     monkeypatch.setattr(network, "weights_file", lambda: tmp_path / "other.pth")
     with pytest.raises(ValueError, match="other weights than expected"):
-        network._onnx.__wrapped__()
+        network._frozen()
 
 
 def test_segmentations_of_a_frame_share_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
 
-    def layer(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-        runs.append(planes.shape)
-        return cv2.resize(planes[0, 0], (14, 14))[None, None].repeat(112, axis=1)
+    def layer(image: NDArray[np.float32]) -> NDArray[np.float32]:
+        runs.append(image.shape)
+        return cv2.resize(image[..., 0], (14, 14))[..., None].repeat(112, axis=2)
 
     monkeypatch.setattr(network, "_NET", layer)
     frame = np.random.default_rng(2).integers(0, 256, (120, 160, 3), np.uint8)
     first, *_ = several = hbr.ViewsTogether("network").add(frame)
     for one in several:
         descriptor("network").describe(one)
-    assert runs == [(1, 3, 224, 224)]
+    assert runs == [(224, 224, 3)]
     np.testing.assert_array_equal(descriptor("network").describe(first), descriptor("network").describe(frame))
 
 

@@ -13,6 +13,15 @@ void hbr_paths(const uint8_t *, int64_t, int64_t, int64_t, const uint8_t *, int6
                int64_t *);
 void hbr_cedd(const uint8_t *, int64_t, int64_t, int64_t, int64_t, int64_t, const void *, double *, uint8_t *);
 
+typedef struct {
+    const float *input, *weights, *bias, *added;
+    float *output;
+    const int64_t *taps;
+    int64_t tap_count, is_alone, height, width, channels, outputs, row, column, output_row, output_column;
+    float low, high;
+} layer_t;
+void hbr_layers(const layer_t *, int64_t);
+
 static uint64_t state = 88172645463325252ULL, sum = 1469598103934665603ULL;
 
 static uint64_t random_bits(void) {
@@ -102,6 +111,23 @@ static void cedd(void) {
     }
 }
 
+/* A convolution of 3 x 3 pixels, and one of each channel alone. */
+static void layers(void) {
+    static float image[14 * 14 * 24], weights[9 * 24 * 48], bias[48], found[12 * 12 * 48], alone[12 * 12 * 24];
+    int64_t taps[9];
+    for (size_t i = 0; i < sizeof image / sizeof *image; i++) image[i] = (float)(random_bits() % 2000) / 1e3f - 1;
+    for (size_t i = 0; i < sizeof weights / sizeof *weights; i++) weights[i] = (float)(random_bits() % 2000) / 1e3f - 1;
+    for (int i = 0; i < 48; i++) bias[i] = (float)(random_bits() % 1000) / 1e3f;
+    for (int i = 0; i < 9; i++) taps[i] = (i / 3 * 14 + i % 3) * 24;
+    const layer_t both[2] = {
+        {image, weights, bias, 0, found, taps, 9, 0, 12, 12, 24, 48, 14 * 24, 24, 12 * 48, 48, -1, 6},
+        {image, weights, bias, alone, alone, taps, 9, 1, 12, 12, 24, 24, 14 * 24, 24, 12 * 24, 24, -1, 6},
+    };
+    hbr_layers(both, 2);
+    add(found, sizeof found);
+    add(alone, sizeof alone);
+}
+
 int main(void) {
     support();
     printf("support %016llx\n", (unsigned long long)sum);
@@ -111,5 +137,7 @@ int main(void) {
     printf("paths %016llx\n", (unsigned long long)sum);
     next_view();
     printf("next_view %016llx\n", (unsigned long long)sum);
+    layers();
+    printf("layers %016llx\n", (unsigned long long)sum);
     return 0;
 }
