@@ -11,11 +11,9 @@ import importlib
 import posixpath
 import re
 import sys
-import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
-from types import UnionType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -109,7 +107,8 @@ def _parameter_table(parameters: list[Any]) -> list[str]:
 
 def configuration_page() -> str:
     """Return a page with every key of `rig.toml`."""
-    from rig.config import RigConfig
+    from rig.config import RigConfig, Section
+    from rig.config.wording import key_info
     from sim.bench import SimOptions
     from sim.photographs import PhotographOptions
 
@@ -118,66 +117,28 @@ def configuration_page() -> str:
         "where each comes from; `rig config set KEY VALUE` changes one; `--set KEY=VALUE` overrides one for a single "
         "command.\n"
     ]
-    plain = {name: field for name, field in RigConfig.model_fields.items() if not _section(field)}
-    plain.pop("bench")
+    sections = {name: field.annotation for name, field in RigConfig.model_fields.items()}
+    sections = {name: kind for name, kind in sections.items() if isinstance(kind, type) and issubclass(kind, Section)}
+    plain = [info for info in key_info(RigConfig) if len(info.key) == 1 and info.name != "bench"]
     lines += ["## Top level\n", *_key_table(plain)]
-    for name, field in RigConfig.model_fields.items():
-        if section := _section(field):
-            lines += [f"\n## [{name}]\n", _unwrapped(section.__doc__ or ""), "", *_key_table(section.model_fields)]
-    lines += ["\n## [bench.sim]\n", "The simulated bench.\n", *_key_table(SimOptions.model_fields)]
-    own = {key: field for key, field in PhotographOptions.model_fields.items() if key not in SimOptions.model_fields}
+    for name, section in sections.items():
+        lines += [f"\n## [{name}]\n", _unwrapped(section.__doc__ or ""), "", *_key_table(key_info(section))]
+    lines += ["\n## [bench.sim]\n", "The simulated bench.\n", *_key_table(key_info(SimOptions))]
+    own = [info for info in key_info(PhotographOptions) if info.name not in SimOptions.model_fields]
     lines += ["\n## [bench.photographs]\n", "The bench of photographs. It has the keys of [bench.sim], too.\n"]
     lines += [*_key_table(own), ""]
     return "\n".join(lines)
 
 
-def _section(field: Any) -> Any:
-    from rig.config import Section
+def _key_table(keys: Iterable[Any]) -> list[str]:
+    from rig.config.toml_file import stated
 
-    kind = field.annotation
-    return kind if isinstance(kind, type) and issubclass(kind, Section) else None
-
-
-def _key_table(fields: dict[str, Any]) -> list[str]:
-    lines = ["| key | type | default | range | meaning |", "|---|---|---|---|---|"]
-    for name, field in fields.items():
-        limits = []
-        for constraint in field.metadata:
-            for attribute, sign in (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<")):
-                if (bound := getattr(constraint, attribute, None)) is not None:
-                    limits.append(f"{sign} {bound:.10g}")
-        default = field.get_default(call_default_factory=True)
-        shown = "–" if default is None else f"`{_toml(default)}`"
-        cells = (f"`{name}`", _type_words(field.annotation), shown, ", ".join(limits), _cell(field.description or ""))
-        lines.append(f"| {' | '.join(cells)} |")
+    lines = ["| key | values | default | meaning |", "|---|---|---|---|"]
+    for info in keys:
+        default = "–" if info.default is None else f"`{stated(info.key, info.default)}`"
+        cells = f"`{info.name}`", info.values, default, info.description
+        lines.append(f"| {' | '.join(map(_cell, cells))} |")
     return lines
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _type_words(kind: Any) -> str:
-    arguments = typing.get_args(kind)
-    origin = typing.get_origin(kind)
-    if origin is typing.Literal:
-        return ", ".join(f"`{_toml(choice)}`" for choice in arguments)
-    if origin is typing.Annotated:
-        return _type_words(arguments[0])
-    if origin in (typing.Union, UnionType):
-        return " or ".join(_type_words(choice) for choice in arguments if choice is not type(None))
-    if origin in (tuple, list):
-        return f"list of {len(arguments) if origin is tuple else ''} {_type_words(arguments[0])}s".replace("  ", " ")
-    if origin is dict:
-        return "table"
-    names = {int: "integer", float: "number", str: "text", bool: "true or false", Path: "path"}
-    return names.get(kind, getattr(kind, "__name__", str(kind)))
 
 
 def errors_page() -> str:

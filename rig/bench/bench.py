@@ -335,7 +335,7 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
     config, options = RigConfig(), {}
     where = str(read.path) if read.path else "the command line"
     try:
-        config = validate(RigConfig, read.values, where=where, places=read.places)
+        config = validate(RigConfig, read.values, where=where)
     except ConfigError as error:
         found += error.evidence["mistakes"]
     sections = read.values.get("bench", {})
@@ -344,9 +344,7 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
     for name in sorted({*bench_names(), *sections}):
         try:
             kind = bench_kind(name)
-            options[name] = validate(
-                kind.options, sections.get(name, {}), where=where, prefix=f"bench.{name}", places=read.places
-            )
+            options[name] = validate(kind.options, sections.get(name, {}), where=where, prefix=f"bench.{name}")
         except ConfigError as error:
             found += error.evidence.get("mistakes") or [f"bench.{name}: {error.what} {error.next_step}"]
     if found:

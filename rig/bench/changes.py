@@ -21,11 +21,10 @@ def set_key(target: Path, key: str, value: str, overrides: Iterable[str] = ()) -
     try:
         check_config(read_values(target if there else None, [*overrides, f"{key}={value}"]))
     except ConfigError as error:
-        mistakes = [mistake.removeprefix("--set: ") for mistake in error.evidence.get("mistakes", ())]
         raise ConfigError(
             f"{target} is unchanged: it would have mistakes.",
             next_step=("Give another value. To choose one,", Do.SHOW_CONFIGURATION()),
-            evidence={"mistakes": mistakes} if mistakes else error.evidence,
+            evidence=error.evidence,
         ) from error
     new = with_values(old, {tuple(key.split(".")): parsed(value)})
     if new != old:

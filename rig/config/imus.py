@@ -83,11 +83,6 @@ _NO_DEVICE: Final = {
     0xFF: "no device: SDA is not connected",
     0xFB: "a BNO055 whose registers are read at a wrong position: the bus loses clock pulses",
 }
-# Usual reasons for an answer from another chip.
-_ALSO_AT: Final = {
-    0x68: "the clocks DS1307 and DS3231 also have address 0x68",
-    0x28: "a BNO080 or BNO085 uses another protocol at similar addresses",
-}
 
 
 def imu_kinds() -> dict[str, ImuKind]:
@@ -120,7 +115,5 @@ def recognised(address: int, register: int, value: int) -> ImuKind | None:
 
 def likely_device(wanted: ImuKind, address: int, value: int) -> str:
     """Describe what answers in place of the sensor ``wanted``, by the value of its identity register."""
-    if (other := recognised(address, wanted.register, value)) is not None:
-        return other.name
-    unknown = "another chip; " + next((text for at, text in _ALSO_AT.items() if at in wanted.addresses), "")
-    return _NO_DEVICE.get(value, unknown.removesuffix("; "))
+    other = recognised(address, wanted.register, value)
+    return other.name if other is not None else _NO_DEVICE.get(value, "another chip")

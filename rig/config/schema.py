@@ -1,23 +1,338 @@
 """The configuration `rig.toml`: all keys with unit, range and default."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 import platformdirs
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from rig.config.catalog_place import CatalogPlace
-from rig.config.device_sections import CameraConfig, CameraTimeConfig, HeadConfig, ImuConfig, ServoConfig
-from rig.config.section import Section
-from rig.config.table_sections import MarkConfig, SafetyConfig, TableConfig
+from rig.config.imus import imu_kind
+from rig.config.servos import driven
+from rig.config.toml_file import NONE
 from rig.config.values import APP, read_values, validate
+from rig.config.wording import is_optional
 from rig.core.masking import masked
 
+MAX_LIMIT_DEG = 90_000.0
+"""250 revolutions; extended position mode reaches 256 in each direction (e-manual, Operating Mode)."""
+
+Degrees = Annotated[float, Field(allow_inf_nan=False)]
+Harmonic = Annotated[float, Field(ge=-10, le=10)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+InCameraUnit = Annotated[float, Field(ge=0, le=1e6)]
 Mode = Literal["auto", "step", "fly"]
 """Whether views are taken at rest (step) or while the table rotates (fly)."""
+
+
+class Section(BaseModel):
+    """Base of all sections: unknown keys are errors, and values cannot change.
+
+    TOML has no null: the text ``"none"`` clears an optional key.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_none(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        cleared = {key for key in values if values[key] == NONE and key in cls.model_fields}
+        return {k: None if k in cleared and is_optional(cls.model_fields[k]) else v for k, v in values.items()}
+
+
+class ServoConfig(Section):
+    """The servo: its connection and its model."""
+
+    port: str = Field("/dev/ttyUSB0", description="serial port of the U2D2 or another adapter")
+    baud: int = Field(57600, ge=9600, le=4_500_000, description="baud rate; the servo's factory setting is 57600")
+    id: int = Field(1, ge=0, le=252, description="id on the bus")
+    model: str = Field(
+        "xl430_w250",
+        description="model of the X, MX (2.0), P or PRO (A) series as in the SDK, or one of a plug-in; "
+        "`rig find` names yours",
+    )
+    gear_ratio: float = Field(
+        1.0,
+        ge=0.001,
+        le=1000,
+        description="revolutions of the servo for one revolution of the table; table.direction sets the direction",
+    )
+    retries: int = Field(
+        3, ge=0, le=20, description="repetitions of a failed transaction before the servo counts as silent"
+    )
+    write_settings: bool = Field(
+        False, description="write EEPROM settings that differ from the ones that the rig needs"
+    )
+
+    @field_validator("model")
+    @classmethod
+    def _model_with_a_driver(cls, model: str) -> str:
+        return driven(model)
+
+
+class ImuConfig(Section):
+    """The IMU: its connection and its mounting."""
+
+    connection: Literal["i2c", "head"] = Field(
+        "i2c", description="what the sensor is connected to: the computer's own I2C bus, or a rig head, see [head]"
+    )
+    model: str = Field(
+        "mpu6050",
+        description="sensor on the platter: mpu6050, mpu6500, mpu9250, mpu6050_clone, bno055, or one of a plug-in; "
+        "`rig find` names yours",
+    )
+    bus: int | str = Field(1, description="I2C bus number, or the path of its device")
+    address: int = Field(
+        0x68,
+        ge=0x08,
+        le=0x77,
+        validate_default=True,
+        description="I2C address; an MPU has 0x68, or 0x69 with AD0 high; a BNO055 0x28, or 0x29 with ADR high",
+    )
+    axis: Literal["x", "y", "z"] = Field("z", description="the sensor's axis that is parallel to the table's axis")
+    sign: Literal[1, -1] = Field(1, description="+1 if a counter-clockwise rotation reads positive")
+    range_dps: Literal[250, 500, 1000, 2000] = Field(250, description="full scale of the gyro")
+    rate_hz: float = Field(200.0, ge=4, le=1000, description="samples per second (MPU; a BNO055 has 100)")
+    bandwidth_hz: Literal[188, 98, 42, 20, 10, 5] = Field(
+        42, description="bandwidth of the MPU's low-pass filter; must be below half of rate_hz to avoid aliasing"
+    )
+    scale: float = Field(1.0, ge=0.8, le=1.25, description="true rate divided by measured rate, from calibration")
+    scale_uncertainty: float = Field(
+        0.012, ge=0, le=0.1, description="standard uncertainty of the scale; 0.012 without calibration"
+    )
+
+    @field_validator("model")
+    @classmethod
+    def _model_with_a_driver(cls, model: str) -> str:
+        return imu_kind(model).key
+
+    @field_validator("address")
+    @classmethod
+    def _address_of_the_model(cls, address: int, others: ValidationInfo) -> int:
+        # The default is the MPU-6050's address, which other sensors cannot have.
+        addresses = imu_kind(others.data["model"]).addresses if "model" in others.data else (address,)
+        return addresses[0] if address == 0x68 and address not in addresses else address
+
+
+class HeadConfig(Section):
+    """The rig head: a small board that samples the IMU and keeps the bench safe (``imu.connection = "head"``)."""
+
+    port: str = Field("/dev/ttyUSB1", description="serial port of the board")
+    deadman_s: float = Field(
+        0.25, ge=0.05, le=2, description="silence of this computer after which the head switches its outputs off"
+    )
+    light: float | None = Field(
+        None,
+        ge=0.001,
+        le=1,
+        description="duty cycle of the ring light while the bench is open; none: no light is connected to the head",
+    )
+    power: bool = Field(False, description="whether the servo's supply goes through the head's relay")
+
+
+class CameraConfig(Section):
+    """The camera and its locked settings."""
+
+    source: int | str = Field(
+        0,
+        description="index or path of the camera, for OpenCV; picamera2 or picamera2:1: a camera on the ribbon cable "
+        "of a Raspberry Pi",
+    )
+    width: int = Field(640, ge=80, le=8000, description="pixels")
+    height: int = Field(480, ge=80, le=8000, description="pixels")
+    fps: float = Field(30.0, ge=0.1, le=500, description="frames per second")
+    fourcc: str | None = Field(
+        None,
+        pattern="^[A-Z0-9]{4}$",
+        description="pixel format, e.g. YUYV or MJPG; none: an uncompressed one if the camera is fast enough with it, "
+        "else MJPG",
+    )
+    exposure_us: float | None = Field(
+        10_000.0,
+        ge=1,
+        le=1e6,
+        description="locked exposure time; none keeps the camera's own. 10 ms is a period of lamps at 50 Hz mains; use "
+        "8333 at 60 Hz",
+    )
+    gain: InCameraUnit | None = Field(
+        0.0, description="locked gain in the camera's unit, at least its smallest; none keeps the camera's own"
+    )
+    white_balance_k: float | None = Field(
+        5000.0, ge=1000, le=20000, description="locked white balance; none keeps the camera's own"
+    )
+    focus: InCameraUnit | None = Field(
+        None,
+        description="locked focus in the camera's unit; none: the autofocus finds it once, and the bench stores it",
+    )
+    sharpness: InCameraUnit | None = Field(
+        None, description="sharpness in the camera's unit; none keeps the camera's own"
+    )
+    backlight_compensation: InCameraUnit | None = Field(
+        None, description="backlight compensation in the camera's unit; none keeps the camera's own"
+    )
+    power_line_frequency: int | None = Field(
+        None,
+        ge=0,
+        le=3,
+        description="flicker filter: 0 off, 1 50 Hz, 2 60 Hz, 3 automatic; none keeps the camera's own",
+    )
+
+
+class CameraTimeConfig(Section):
+    """When frames are exposed, from `rig calibrate camera-time`."""
+
+    offset_ms: float | None = Field(
+        None,
+        ge=-1000,
+        le=1000,
+        description="time from a frame's time stamp to the middle of its exposure in the middle row; none: not "
+        "calibrated, and no view is taken in motion",
+    )
+    uncertainty_ms: float = Field(0.2, ge=0, le=100, description="standard uncertainty of this time")
+    jitter_ms: float = Field(0.5, ge=0, le=100, description="standard deviation of this time from frame to frame")
+    readout_ms: float = Field(0.0, ge=0, le=1000, description="time from the first to the last row (rolling shutter)")
+
+
+class TableConfig(Section):
+    """The table: how it moves, and when it has settled."""
+
+    mode: Literal["turntable", "pan"] = Field(
+        "turntable",
+        description="turntable: rotates beyond one revolution and counts revolutions; pan: stays within one revolution",
+    )
+    direction: Literal[1, -1] = Field(
+        1, description="+1: a rising servo position rotates the table counter-clockwise, seen from above"
+    )
+    carries: Literal["object", "camera"] = Field(
+        "object",
+        description="what the servo rotates: the object in front of the camera, or the camera around the object",
+    )
+    zero_deg: float = Field(
+        180.0,
+        ge=-MAX_LIMIT_DEG,
+        le=MAX_LIMIT_DEG,
+        description="servo angle at home (table angle 0), on the table's side of the gear",
+    )
+    limits_deg: tuple[Degrees, Degrees] = Field(
+        (-400.0, 400.0), description="cable budget: lowest and highest table angle"
+    )
+    velocity_dps: float = Field(90.0, ge=0.1, le=200, description="cruise speed; must be within the gyro's range")
+    acceleration_dps2: float = Field(240.0, ge=0.1, le=5000, description="acceleration of the ramp")
+    approach_deg: float = Field(
+        3.0,
+        ge=0,
+        le=30,
+        description="each stop is approached upwards from at least this far below, which takes up the gears' backlash",
+    )
+    # A position controller without an integral part stops where friction equals its push. An XL430 with factory gains
+    # pushes with its stall torque at 15.6°; 2.5 % of that is a usual friction (0.4°), and 6.4 % are accepted.
+    tolerance_deg: float = Field(
+        1.0, ge=0.001, le=5, description="largest distance from the goal at which friction may hold an arrived table"
+    )
+    encoder_harmonics_deg: tuple[Harmonic, Harmonic, Harmonic, Harmonic] = Field(
+        (0.0, 0.0, 0.0, 0.0),
+        description="encoder error over a revolution: cosine and sine of the first and the second harmonic, from "
+        "calibration",
+    )
+    backlash_deg: float = Field(
+        0.5, ge=0, le=10, description="largest backlash between encoder and platter that is not a fault"
+    )
+    orientation: Literal["encoder", "imu"] = Field(
+        "encoder", description="source of a view's angle: the servo's encoder, or only the gyro on the platter"
+    )
+    ringing_hz: float = Field(
+        0.0,
+        ge=0,
+        le=200,
+        description="frequency at which the platter rings after a stop, from calibration; moves then do not excite it; "
+        "0: not known",
+    )
+    ringing_damping: float = Field(0.05, ge=0.001, le=0.9, description="damping ratio of that ringing")
+    lag_s: float = Field(
+        0.0, ge=0, le=0.3, description="time by which the shaft lags behind the profile, from that calibration"
+    )
+    held_deg: float = Field(
+        0.0, ge=0, le=5, description="distance from its goal at which friction holds the shaft, from that calibration"
+    )
+    quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
+    # shorter: a platter that rings with 6 Hz is faster than quiet_dps only once in 0.083 s; longer: each view waits
+    quiet_s: float = Field(0.1, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
+    poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
+    watchdog_s: float = Field(
+        0.5, ge=0.1, le=2.5, description="the servo stops by itself after this time without instructions"
+    )
+
+    @field_validator("limits_deg")
+    @classmethod
+    def _limits_hold_a_revolution(cls, limits_deg: tuple[float, float], others: ValidationInfo) -> tuple[float, float]:
+        low, high = limits_deg
+        pan = others.data.get("mode") == "pan"
+        if pan and not (low <= 0 <= high and low < high):
+            raise ValueError("must be the lowest and the highest angle and include 0, e.g. [-150, 150]")
+        if not pan and not (low <= 0 <= high and high - low >= 360):
+            raise ValueError('must span at least one revolution and include 0, e.g. [-400, 400], unless mode = "pan"')
+        if max(-low, high) > MAX_LIMIT_DEG:
+            raise ValueError(f"must be within ±{MAX_LIMIT_DEG:g}, the range of a servo in extended position mode")
+        return limits_deg
+
+    @field_validator("watchdog_s")
+    @classmethod
+    def _watchdog_outlasts_the_loop(cls, watchdog_s: float, others: ValidationInfo) -> float:
+        poll_s = others.data.get("poll_s", 0.0)
+        if watchdog_s < 2 * poll_s:
+            raise ValueError(f"must be at least twice poll_s, which is {poll_s:g}: the control loop feeds the watchdog")
+        return watchdog_s
+
+    @property
+    def orientation_sign(self) -> int:
+        """Sign of the camera's azimuth around the object: −1 if the table angle θ rotates the object, else +1."""
+        return 1 if self.carries == "camera" else -1
+
+
+class MarkConfig(Section):
+    """The home mark, from calibration: a card on the platter that shows the table's angle to the camera."""
+
+    card: tuple[int, int, float, float] = Field(
+        (0, 0, 0.0, 0.0), description="columns, rows, side of a square and of a marker in mm; no columns: there is none"
+    )
+    camera: tuple[float, float, float, float, float, float, float, float] = Field(
+        (0.0,) * 8, description="fx, fy, cx, cy, k1, k2, p1 and p2 of the camera that saw it"
+    )
+    rotation: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="rotation vector of the card in the camera's frame at home"
+    )
+    axis: tuple[float, float, float] = Field((0.0, 0.0, 1.0), description="the table's axis in the camera's frame")
+
+
+class SafetyConfig(Section):
+    """When a motion is stopped: before the servo shuts down by itself, and long before something breaks."""
+
+    # An XL430 with factory gains lags by 3.8° at 90 °/s, and by 8.5° at 200 °/s, the fastest table.
+    following_error_deg: float = Field(
+        12.0,
+        ge=0.01,
+        le=90,
+        description="largest distance of the shaft from the servo's motion profile, and from its path",
+    )
+    max_load_percent: float = Field(
+        70.0,
+        ge=0.1,
+        le=100,
+        description="largest part of the servo's torque (or current limit) that is not an overload",
+    )
+    temperature_margin_c: float = Field(
+        5.0, ge=0, le=40, description="distance from the temperature at which the servo shuts down"
+    )
+    voltage_margin_v: float = Field(
+        0.2, ge=0, le=2, description="distance from the voltages at which the servo shuts down"
+    )
+    slip_deg: float = Field(
+        10.0, ge=0.01, le=90, description="difference of encoder and gyro (beyond 4 sigma) that stops a motion"
+    )
 
 
 class ViewConfig(Section):
@@ -108,11 +423,6 @@ class IdentifyConfig(Section):
     )
     first_step_deg: float = Field(
         90.0, ge=-180, le=180, description="rotation between the first two views; positive is counter-clockwise"
-    )
-    omega: float = Field(0.5, ge=0, le=100, description="weight of the orientation term")
-    list_length: int = Field(10, ge=1, le=1000, description="views on a retrieval list")
-    extension: Literal["visual", "orient", "orient_all"] = Field(
-        "orient_all", description="how missing views are filled in"
     )
     record: Literal["image", "answer", "none"] = Field(
         "image",
@@ -252,4 +562,4 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = (), *, sear
     """
     read = read_values(path, overrides, search=search)
     where = str(read.path) if read.path else "the command line"
-    return validate(RigConfig, read.values, where=where, places=read.places)
+    return validate(RigConfig, read.values, where=where)

@@ -2,7 +2,7 @@
 
 An edit replaces or inserts one line ``key = value`` below the header of its table. `tomllib` reads the result, and an
 edit that changed anything else is rejected: values of several lines, inline tables and dotted keys are for people.
-tomlkit is not used, because it does not put a new key below its commented default, and reports no line numbers.
+tomlkit is not used, because it does not put a new key below its commented default.
 """
 
 import difflib
@@ -59,19 +59,6 @@ def loads(text: str) -> dict[str, Any]:
     if inside:
         raise ValueError(f"tables or lists are nested more than {MAX_DEPTH} deep")
     return values
-
-
-def line_numbers(text: str) -> dict[Key, int]:
-    """Return the line of each key and table, for messages. A text of several lines may hold what looks like one."""
-    found: dict[Key, int] = {}
-    table: Key = ()
-    for number, line in enumerate(StringIO(text), 1):
-        if header := _HEADER.fullmatch(line.rstrip()):
-            table = _parts(header[1])
-            found.setdefault(table, number)
-        elif assigned := _ASSIGNED.match(line):
-            found.setdefault((*table, *_parts(assigned[1])), number)
-    return found
 
 
 def with_values(text: str, changes: Mapping[Key, Any]) -> str:
@@ -165,14 +152,14 @@ def stated(key: Key, value: Any) -> str:
 
 def _edited(text: str, key: Key, value: Any) -> str:
     """Return the document with the line of a key replaced or inserted; the caller checks that it is right."""
-    lines, newline = StringIO(text, newline="").readlines(), "\r\n" if "\r\n" in text else "\n"
+    lines = StringIO(text, newline="").readlines()
     new = f"{_written(key[-1:])} = {stated(key, value)}"
     headers = [at for at, line in enumerate(lines) if _HEADER.fullmatch(line.rstrip())]
     begin = next((at + 1 for at in headers if _table(lines[at]) == key[:-1]), 0 if len(key) == 1 else None)
     if begin is None:
         before = "".join(lines)
-        gap = newline * (bool(before) + (bool(before) and not before.endswith("\n")))
-        return f"{before}{gap}[{_written(key[:-1])}]{newline}{new}{newline}"
+        gap = "\n" * (bool(before) + (bool(before) and not before.endswith("\n")))
+        return f"{before}{gap}[{_written(key[:-1])}]\n{new}\n"
     end = next((at for at in headers if at >= begin), len(lines))
     # Replace the value, and keep its comment.
     for at in range(begin, end):
@@ -185,8 +172,8 @@ def _edited(text: str, key: Key, value: Any) -> str:
     last = [at + 1 for at in range(begin, end) if lines[at].strip() and not lines[at].lstrip().startswith("#")]
     place = next((at + 1 for at in range(begin, end) if default.match(lines[at])), max(last, default=begin))
     if place and not lines[place - 1].endswith("\n"):
-        lines[place - 1] += newline
-    return "".join([*lines[:place], new, newline, *lines[place:]])
+        lines[place - 1] += "\n"
+    return "".join([*lines[:place], f"{new}\n", *lines[place:]])
 
 
 def _table(line: str) -> Key:
@@ -214,11 +201,8 @@ def _written(key: Key) -> str:
 
 def _same(one: Any, other: Any) -> bool:
     """Compare as TOML does: 1, 1.0 and true are different values, and not-a-number equals itself."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(_same, one, other))
-    return type(one) is type(other) and (one == other or (one != one and other != other))
+    first, second = (json.dumps(value, sort_keys=True, default=repr) for value in (one, other))
+    return first == second
 
 
 def _cannot_edit(key: Key, value: Any, reason: str) -> ConfigError:

@@ -1,7 +1,6 @@
-"""Reads a configuration file and the settings of the command line, and checks them; reports all mistakes with lines."""
+"""Reads a configuration file and the settings of the command line, and checks them; reports all mistakes."""
 
 import os
-import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import Any, TypeVar
 import platformdirs
 from pydantic import BaseModel, ValidationError
 
-from rig.config.toml_file import MAX_DEPTH, NONE, Key, line_numbers, loads, read_text
+from rig.config.toml_file import MAX_DEPTH, NONE, Key, loads, read_text
 from rig.config.wording import mistakes
 from rig.core.errors import ConfigError
 from rig.core.next_steps import Do
@@ -38,18 +37,21 @@ def search_paths() -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class Values:
-    """Unchecked values of a file and the command line, and where each comes from."""
+    """Unchecked values of a file and the command line; ``overridden`` are the keys that the command line gives."""
 
     path: Path | None
     values: dict[str, Any]
-    places: dict[Key, str]
+    overridden: frozenset[Key]
 
     def origin(self, key: Key) -> str:
-        """Return where a key's value comes from: ``rig.toml line 3``, ``--set``, or ``default``."""
-        place = next((self.places[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.places), None)
-        if place is None or not _holds(self.values, key):
-            return "default"
-        return f"{self.path.name} {place}" if self.path and place.startswith("line") else place
+        """Return where a key's value comes from: ``rig.toml``, ``--set``, or ``default``."""
+        here: Any = self.values
+        for part in key:
+            if not isinstance(here, Mapping) or part not in here:
+                return "default"
+            here = here[part]
+        is_overridden = any(key[:n] in self.overridden for n in range(1, len(key) + 1))
+        return "--set" if is_overridden or self.path is None else self.path.name
 
 
 def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, search: bool = True) -> Values:
@@ -60,38 +62,32 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, sear
     Raises `ConfigError`: the file is missing or is not TOML, or an override is invalid.
     """
     values: dict[str, Any] = {}
-    places: dict[Key, str] = {}
     source = path or (default_path() if search else None)
     if source is not None:
         text = read_text(source)
         try:
             values = loads(text)
-            places = {key: f"line {line}" for key, line in line_numbers(text).items()}
         except ValueError as error:
             raise ConfigError(
                 f"{source} is not a TOML file.",
                 next_step="Fix this line.",
-                evidence={"reason": str(error), **_line_named(text, str(error))},
+                evidence={"reason": str(error)},
             ) from error
         for key in _PATHS:
             _resolve(values, key, source.resolve().parent)
-    for override in overrides:
-        places[_apply(values, override)] = "--set"
-    return Values(source, values, places)
+    return Values(source, values, frozenset([_apply(values, override) for override in overrides]))
 
 
-def validate(
-    model: type[M], values: Mapping[str, Any], *, where: str, prefix: str = "", places: Mapping[Key, str] | None = None
-) -> M:
+def validate(model: type[M], values: Mapping[str, Any], *, where: str, prefix: str = "") -> M:
     """Return ``values`` as ``model``; raises one `ConfigError` with all mistakes.
 
-    ``prefix`` is the model's path in the configuration, ``places`` the place of each key in a file.
+    ``prefix`` is the model's path in the configuration.
     """
     try:
         return model.model_validate(values)
     except ValidationError as error:
         above = tuple(prefix.split(".")) if prefix else ()
-        found = mistakes(model, values, error.errors(include_url=False), above, places or {})
+        found = mistakes(model, values, error.errors(include_url=False), above)
     raise config_mistakes(found, where)
 
 
@@ -111,24 +107,6 @@ def _resolve(values: dict[str, Any], key: Key, folder: Path) -> None:
         here = here.get(part) if isinstance(here, dict) else None
     if isinstance(here, dict) and isinstance(here.get(key[-1]), str) and here[key[-1]] != NONE:
         here[key[-1]] = os.path.normpath(folder / Path(here[key[-1]]).expanduser())
-
-
-def _holds(values: Mapping[str, Any], key: Key) -> bool:
-    here: Any = values
-    for part in key:
-        if not isinstance(here, Mapping) or part not in here:
-            return False
-        here = here[part]
-    return True
-
-
-def _line_named(text: str, reason: str) -> dict[str, str]:
-    """Return the line that a message of `tomllib` names, as evidence."""
-    named = re.search(r"at line (\d+)", reason)
-    lines = text.splitlines()
-    if named is None or not 0 < int(named[1]) <= len(lines):
-        return {}
-    return {f"line {named[1]}": lines[int(named[1]) - 1].strip()}
 
 
 def _apply(values: dict[str, Any], override: str) -> Key:

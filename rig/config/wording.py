@@ -8,7 +8,6 @@ from textwrap import wrap
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
-from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -57,6 +56,11 @@ class KeyInfo:
     def name(self) -> str:
         return ".".join(self.key)
 
+    @property
+    def values(self) -> str:
+        """Its allowed values with their unit: ``a number from 1 to 5 s, or none``."""
+        return in_unit(self.allowed.removesuffix(_OR_NONE), self.unit) + _OR_NONE * self.allowed.endswith(_OR_NONE)
+
     def value(self, values: Any) -> Any:
         """Return the value of the key in a model or in nested mappings; None if these do not have it."""
         for part in self.key:
@@ -67,11 +71,12 @@ class KeyInfo:
 def key_info(model: type[BaseModel], above: Key = ()) -> Iterator[KeyInfo]:
     """Yield the keys of a model and of its sections, in order."""
     for name, field in model.model_fields.items():
-        if (inner := _section(field)) is not None:
-            yield from key_info(inner, (*above, name))
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from key_info(kind, (*above, name))
         else:
             default = field.get_default(call_default_factory=True, validated_data={})
-            choices = get_args(field.annotation) if get_origin(field.annotation) is Literal else ()
+            choices = get_args(kind) if get_origin(kind) is Literal else ()
             yield KeyInfo((*above, name), default, allowed(field), choices, unit(name), field.description or "")
 
 
@@ -85,7 +90,7 @@ def blank_file(model: type[BaseModel]) -> str:
         if info.key[:-1] != section:
             section = info.key[:-1]
             lines += ["", f"[{'.'.join(section)}]"]
-        meaning = f"{info.description} ({_with_unit(info.allowed, info.unit)})"
+        meaning = f"{info.description} ({info.values})"
         lines += wrap(meaning, 100, initial_indent="# ", subsequent_indent="#   ")
         lines.append(f"#{info.key[-1]} = {stated(info.key, info.default)}")
     return "\n".join(lines) + "\n"
@@ -96,11 +101,6 @@ def setting_line(info: KeyInfo, value: Any, origin: str) -> str:
     line = f"{info.key[-1]} = {stated(info.key, value)}"
     note = "; ".join(part for part in (info.unit, origin, info.description) if part)
     return f"{line:30s} # {note}"
-
-
-def _with_unit(allowed: str, unit: str) -> str:
-    """Return allowed values with their unit: ``a number from 1 to 5 s, or none``."""
-    return in_unit(allowed.removesuffix(_OR_NONE), unit) + _OR_NONE * allowed.endswith(_OR_NONE)
 
 
 def unit(name: str) -> str:
@@ -118,64 +118,34 @@ def is_optional(field: FieldInfo) -> bool:
     return NoneType in get_args(field.annotation)
 
 
-def mistakes(
-    model: type[BaseModel], values: Mapping[str, Any], errors: Sequence[Any], above: Key, places: Mapping[Key, str]
-) -> list[str]:
-    """Return pydantic's ``errors`` as one line for each key: its place, what it must be, and what was found.
+def mistakes(model: type[BaseModel], values: Mapping[str, Any], errors: Sequence[Any], above: Key) -> list[str]:
+    """Return pydantic's ``errors`` as one line for each key: what it must be, and what was found.
 
-    ``above`` is the path of ``model`` in the whole configuration, ``places`` the place of each key in a file.
+    ``above`` is the path of ``model`` in the whole configuration.
     """
+    known = {info.key: info for info in key_info(model)}
     found: dict[Key, str] = {}
     for error in errors:
-        key, field = _field(model, error["loc"])
-        found.setdefault(key, _mistake(model, values, key, field, error))
-    return [f"{_place(above + key, places)}{'.'.join(above + key)}: {text}".lstrip(": ") for key, text in found.items()]
+        # Below a key, the path has members of a union or of a list.
+        path = tuple(map(str, error["loc"]))
+        key = next((path[:n] for n in range(len(path), 0, -1) if path[:n] in known), path)
+        found.setdefault(key, _mistake(known, values, key, error))
+    return [f"{'.'.join(above + key)}: {text}".lstrip(": ") for key, text in found.items()]
 
 
-def _mistake(model: type[BaseModel], values: Mapping[str, Any], key: Key, field: FieldInfo | None, error: Any) -> str:
+def _mistake(known: Mapping[Key, KeyInfo], values: Mapping[str, Any], key: Key, error: Any) -> str:
     if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(key[-1], _names(model, key[:-1]), n=1)
+        last = len(key) - 1
+        beside = dict.fromkeys(other[last] for other in known if other[:last] == key[:last])
+        near = difflib.get_close_matches(key[last], beside, n=1)
         return "unknown key" + (f"; did you mean {near[0]}?" if near else "")
     found: Any = values
     for part in key:
         found = found[part] if isinstance(found, Mapping) and part in found else error["input"]
     shown = "" if isinstance(found, Mapping | BaseModel) else f" (found {found!r})"
-    if error["type"] == "value_error" or field is None:
+    if error["type"] == "value_error" or key not in known:
         return str(error.get("ctx", {}).get("error", error["msg"])) + shown
-    return f"must be {_with_unit(allowed(field), unit(key[-1]))}{shown}"
-
-
-def _field(model: type[BaseModel], path: Sequence[Any]) -> tuple[Key, FieldInfo | None]:
-    """Return the part of pydantic's ``path`` that is a key, and its field; the rest are members of a union."""
-    key: Key = ()
-    field = None
-    for part in path:
-        if field is not None and _section(field) is None:
-            break
-        model = model if field is None else _section(field) or model
-        key, field = (*key, str(part)), model.model_fields.get(str(part))
-        if field is None:
-            break
-    return key, field
-
-
-def _place(key: Key, places: Mapping[Key, str]) -> str:
-    known = next((places[key[:n]] for n in range(len(key), 0, -1) if key[:n] in places), None)
-    return f"{known}: " if known else ""
-
-
-def _names(model: type[BaseModel], path: Key) -> list[str]:
-    for part in path:
-        inner = _section(model.model_fields[part])
-        if inner is None:
-            return []
-        model = inner
-    return list(model.model_fields)
-
-
-def _section(field: FieldInfo) -> type[BaseModel] | None:
-    kind = field.annotation
-    return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+    return f"must be {known[key].values}{shown}"
 
 
 def _kind(annotation: Any, metadata: Sequence[Any] = ()) -> str:
@@ -197,13 +167,8 @@ def _kind(annotation: Any, metadata: Sequence[Any] = ()) -> str:
 
 
 def _range(metadata: Sequence[Any]) -> str:
-    bounds = {type(m): m for m in metadata}
-    low = f"{bounds[Ge].ge:.10g}" if Ge in bounds else None
-    above = f"{bounds[Gt].gt:.10g}" if Gt in bounds else None
-    high = f"{bounds[Le].le:.10g}" if Le in bounds else None
-    below = f"{bounds[Lt].lt:.10g}" if Lt in bounds else None
-    if low and high:
-        return f" from {low} to {high}"
-    start = f"of at least {low}" if low else f"above {above}" if above else ""
-    end = f"of at most {high}" if high and not start else f"up to {high}" if high else f"below {below}" if below else ""
-    return f" {start}, {end}" if start and end else f" {start}{end}" if start or end else ""
+    words = {"ge": "of at least", "gt": "above", "le": "of at most", "lt": "below"}
+    bounds = {name: f"{getattr(m, name):.10g}" for m in metadata for name in words if hasattr(m, name)}
+    if bounds.keys() == {"ge", "le"}:
+        return f" from {bounds['ge']} to {bounds['le']}"
+    return " and".join(f" {words[name]} {bound}" for name, bound in bounds.items())

