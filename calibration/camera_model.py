@@ -4,10 +4,9 @@ Zhang's method (OpenCV's calibrateCamera, model k1, k2, p1, p2), with the standa
 Jacobian at the solution, times the scatter of the residuals.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
@@ -41,8 +40,6 @@ MIN_COVERAGE = 0.5  # distortion is largest at the edges, and extrapolated where
 MAX_RMS_PX = 0.3
 """A sharp camera at rest reaches 0.1: more means blur, or a board that is not flat or moved."""
 MAX_FOCAL_UNCERTAINTY = 0.005  # 0.5 % of a distance of 500 mm is 2.5 mm, the error of a ruler held to a lens
-ENLARGED = 100
-"""Enlargement of the residuals in the chart: a tenth of a pixel is drawn as 10."""
 PARAMETERS = (("fx", "px"), ("fy", "px"), ("cx", "px"), ("cy", "px"), ("k1", ""), ("k2", ""), ("p1", ""), ("p2", ""))
 
 
@@ -64,7 +61,9 @@ def covariance(result: CalibrationResult) -> NDArray[np.float64]:
     board = CharucoBoard(**result.evidence["board"])
     normal = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     for view in result.evidence["views"]:
-        _, jacobian = _projected(view, board, matrix, distortion)
+        points_mm, corners = board.points_mm()[view["ids"]], np.array(view["corners_px"])
+        _, rotation, translation = cv2.solvePnP(points_mm, corners, matrix, np.array(distortion))
+        jacobian = cv2.projectPoints(points_mm, rotation, translation, matrix, np.array(distortion))[1]
         of_pose, of_camera = jacobian[:, :6], jacobian[:, 6 : 6 + len(PARAMETERS)]
         explained = of_pose @ np.linalg.lstsq(of_pose, of_camera, rcond=None)[0]
         normal += of_camera.T @ (of_camera - explained)
@@ -72,16 +71,6 @@ def covariance(result: CalibrationResult) -> NDArray[np.float64]:
     stated = np.array([result.estimates[name].uncertainty for name, _ in PARAMETERS])
     scale = stated / np.sqrt(np.diag(inverse))
     return np.asarray(scale[:, None] * inverse * scale)
-
-
-def _projected(
-    view: Mapping[str, Any], board: CharucoBoard, matrix: NDArray[np.float64], distortion: Sequence[float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of a view where the camera sees them by the fit, (n, 2), and their derivatives, (2 n, ...)."""
-    points_mm, corners, lens = board.points_mm()[view["ids"]], np.array(view["corners_px"]), np.array(distortion)
-    _, rotation, translation = cv2.solvePnP(points_mm, corners, matrix, lens)
-    seen, jacobian = cv2.projectPoints(points_mm, rotation, translation, matrix, lens)
-    return np.asarray(seen, np.float64).reshape(-1, 2), np.asarray(jacobian, np.float64)
 
 
 def plot(result: CalibrationResult) -> Chart | None:
@@ -104,37 +93,13 @@ def plot(result: CalibrationResult) -> Chart | None:
     )
 
 
-def plot_residuals(result: CalibrationResult) -> Chart | None:
-    """Return a chart of each corner's enlarged deviation from the fit, with a colour for each position of the board."""
-    views = result.evidence["views"]
-    if not views or not result.estimates:
-        return None
-    matrix, distortion = matrix_of(result)
-    board = CharucoBoard(**result.evidence["board"])
-    vectors = []
-    for name, colour, of_stand in by_stand(views):
-        for view in of_stand:
-            corners = np.array(view["corners_px"])
-            ends = corners + ENLARGED * (corners - _projected(view, board, matrix, distortion)[0])
-            for x, y in np.stack([corners, ends], axis=2).tolist():
-                vectors.append(Series("", x, y, colour, dots=False, curve=True))
-        vectors.append(Series(name, [], [], colour, dots=False, curve=True))
-    return Chart(
-        f"Corners minus the fit, {ENLARGED} times enlarged: no pattern means noise",
-        Axis("x, px"),
-        Axis("y, px", falling=True),
-        [_frame(result), *vectors],
-        square=True,
-    )
-
-
 @dataclass(frozen=True)
 class CameraModel(Procedure):
     """A procedure that takes views of the board in four positions, from nine sides each."""
 
     result_name, devices, valid_days = NAME, ("camera",), 365
     reference = "ChArUco board, {board.columns} × {board.rows} squares of {board.square_mm:g} mm"
-    plots = (plot, plot_residuals, partial(plot_views, limit_px=MAX_RMS_PX))
+    plots = (plot, partial(plot_views, limit_px=MAX_RMS_PX))
     board: CharucoBoard = field(default_factory=CharucoBoard)
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:

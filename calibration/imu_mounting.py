@@ -1,10 +1,9 @@
-"""Measure the mounting of the IMU on the platter: its tilt against the table's axis, its level, and its delay.
+"""Measure the mounting of the IMU on the platter: its tilt against the table's axis, and its level.
 
 While the table rotates, the rate is along its axis: the direction of the integrated rate in the sensor's frame is the
 axis, in any direction of gravity. At rest the accelerometer shows gravity. The part of its mean over a revolution
 that is not along the axis is its own zero error; the part that rotates with the table is the deviation of the table's
-axis from the vertical. During a rotation after the backlash, the encoder is ahead of the gyro by the rate times the
-delay.
+axis from the vertical.
 """
 
 from collections.abc import Generator, Mapping, Sequence
@@ -21,7 +20,6 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Contribution, Estimate, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.devices.imu import Imu, ImuSamples
-from rig.devices.servo import Servo, ServoState
 from rig.motion.turntable import Turntable
 from rig.plans.steps import moved
 
@@ -36,26 +34,14 @@ MAX_TILT_DEG = 10.0
 MAX_LEVEL_DEG = 5.0  # more is a bench on a slope: the views would show leaning objects
 AXIS_GAIN_SIGMA = 0.015
 """Difference of the scales of two of the gyro's axes, from part to part."""
-MIN_RATE_DPS = 5.0
-"""Rate from which readings during a rotation count; the shaft has run through the backlash before."""
-
-REST_IN_BACKLASH_DEG = 0.04  # a sixth of the backlash of an XL430's gears, 0.25°
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedMove:
-    """One rotation upwards, after the shaft has run through the backlash.
+    """One rotation upwards: the integrated rate (3,) about the sensor's axes, without the zero, and the σ of each."""
 
-    ``rotation_deg`` float64 (3,): the integrated rate about the sensor's axes, without the zero; ``sigma_deg`` of each
-    of them; ``encoder_deg`` the table's rotation; ``lead_deg`` and ``rate_dps`` float64 (n,): the lead of the encoder
-    over the gyro at readings during the rotation, and the table's rate there.
-    """
-
-    encoder_deg: float
     rotation_deg: NDArray[np.float64]
     sigma_deg: float
-    lead_deg: NDArray[np.float64]
-    rate_dps: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,23 +53,19 @@ class GravityReading:
     sigma_g: float
 
 
-class _Tapped:
-    """A device that records the values of one of its readings."""
+class _RecordedImu:
+    """An IMU that keeps the samples that are read from it."""
 
-    def __init__(self, device: Any, reading: str, kept: list[Any]) -> None:
-        self._device, self._reading, self._kept = device, reading, kept
+    def __init__(self, imu: Imu) -> None:
+        self._imu = imu
+        self.kept: list[ImuSamples] = []
 
     def __getattr__(self, name: str) -> Any:
-        attribute = getattr(self._device, name)
-        if name != self._reading:
-            return attribute
+        return getattr(self._imu, name)
 
-        def read() -> Any:
-            value = attribute()
-            self._kept.append(value)
-            return value
-
-        return read
+    def read_samples(self) -> ImuSamples:
+        self.kept.append(self._imu.read_samples())
+        return self.kept[-1]
 
 
 def plot(result: CalibrationResult) -> Chart | None:
@@ -107,7 +89,7 @@ class ImuMounting(Procedure):
     """A procedure that rotates the table once, in eight steps, and reads the sensor at each stop."""
 
     result_name, devices, valid_days, plots = NAME, ("servo", "imu"), 180, (plot,)
-    reference = "gravity, and the axis about which the table rotates; of the delay, encoder of the servo"
+    reference = "gravity, and the axis about which the table rotates"
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         config = bench.config
@@ -118,23 +100,19 @@ class ImuMounting(Procedure):
         column, sign = "xyz".index(config.imu.axis), config.imu.sign
         moves: list[RecordedMove] = []
         levels: list[GravityReading] = []
-        # A turntable keeps the rate about its own axis only: record all that it reads.
-        states: list[ServoState] = []
-        samples: list[ImuSamples] = []
-        recorded_bench = copy(bench)
-        recorded_bench.servo = cast(Servo, _Tapped(bench.servo, "read_state", states))
-        recorded_bench.imu = cast(Imu, _Tapped(bench.imu, "read_samples", samples))
+        # A turntable keeps the rate about its own axis only; the tilt needs all three.
+        recorded_bench, imu = copy(bench), _RecordedImu(bench.imu)
+        recorded_bench.imu = cast(Imu, imu)
         with Turntable(recorded_bench) as table, returning(table) as goto:
             for index in range(STEPS + 1):
                 if index == 0:
                     yield moved(0, goto(first_deg))
                 else:
-                    states.clear()
-                    samples.clear()
+                    imu.kept.clear()
                     _observe_rest(bench, table)
                     before_ns = bench.clock.now_ns()
                     move = goto(first_deg + index * 360.0 / STEPS)
-                    recorded = _recorded_move(states, samples, before_ns, column, sign, config.table.direction)
+                    recorded = _recorded_move(imu.kept, before_ns, column)
                     if recorded is not None:
                         moves.append(recorded)
                     yield moved(index, move)
@@ -146,7 +124,7 @@ class ImuMounting(Procedure):
 
 
 def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *, column: int, sign: int) -> Evaluation:
-    """Evaluate the tilt, the levels and the delay.
+    """Evaluate the tilt and the levels.
 
     ``moves`` and ``levels`` are the measurements over a whole revolution. ``column`` and ``sign`` are the sensor's axis
     that is along the table's axis, and +1 if it points up.
@@ -154,7 +132,6 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
     found = Evaluation(name=NAME, residual_unit="° of tilt")
     found.evidence = {
         "rotations_deg": [move.rotation_deg.tolist() for move in moves],
-        "encoder_deg": [move.encoder_deg for move in moves],
         "levels": [{"table_deg": level.table_deg, "mean_g": level.mean_g.tolist()} for level in levels],
     }
     if len(moves) < STEPS // 2:
@@ -178,7 +155,6 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
         found.reject_if(wrong, RejectionCode.WRONG_AXIS, axis="xyz"[nearest], sign=right_sign)
         found.reject_if(not wrong, RejectionCode.TILT_TOO_LARGE, tilt_deg=tilt_deg, limit_deg=MAX_TILT_DEG)
     found.estimates |= _levels(levels, axis, column, tilts)
-    found.estimates["delay"] = _delay(moves)
     level_deg = hypot(found.estimates["axis_x"].value, found.estimates["axis_y"].value)
     found.reject_above(MAX_LEVEL_DEG, RejectionCode.NOT_LEVEL, level_deg=level_deg)
     return found
@@ -212,26 +188,6 @@ def _levels(
     return estimates
 
 
-def _delay(moves: Sequence[RecordedMove]) -> Estimate:
-    """Return the delay of the gyro's time stamps relative to the encoder's readings."""
-    lead = np.concatenate([move.lead_deg for move in moves])
-    rate = np.concatenate([move.rate_dps for move in moves])
-    norm = float((rate**2).sum())
-    delay = float((rate * lead).sum()) / norm
-    each = [
-        float((move.rate_dps * move.lead_deg).sum() / (move.rate_dps**2).sum()) for move in moves if move.rate_dps.size
-    ]
-    # Readings of one rotation share the encoder's error at its rest, so the rotations are the independent data. A
-    # vibrating platter comes to rest a little inside the backlash, always on the same side.
-    scatter = float(np.std(each, ddof=1)) / sqrt(len(each))
-    per_degree = 1 / float(np.median(rate))
-    budget = (
-        Contribution("scatter of the moves", "A", scatter, "s"),
-        Contribution("rest of the platter in the backlash", "B", REST_IN_BACKLASH_DEG, "°", per_degree),
-    )
-    return Estimate(delay, budget, "s")
-
-
 def _observe_rest(bench: Bench, table: Turntable) -> None:
     """Wait at rest until the gyro's zero is measured."""
     for _ in range(5):
@@ -248,11 +204,9 @@ def _paced(bench: Bench, table: Turntable) -> Generator[None, None, None]:
             table.check_still()
 
 
-def _recorded_move(
-    states: Sequence[ServoState], samples: Sequence[ImuSamples], before_ns: int, column: int, sign: int, direction: int
-) -> RecordedMove | None:
+def _recorded_move(samples: Sequence[ImuSamples], before_ns: int, column: int) -> RecordedMove | None:
     """Return the record of a rotation that began after ``before_ns``; None if samples were lost."""
-    if not states or not samples or any(part.lost for part in samples):
+    if not samples or any(part.lost for part in samples):
         return None
     times = np.concatenate([part.time_ns for part in samples])
     rates = np.concatenate([part.gyro_dps for part in samples])
@@ -260,25 +214,9 @@ def _recorded_move(
     moving = ~at_rest
     if at_rest.sum() < 50 or moving.sum() < 50:
         return None
-    zero = rates[at_rest].mean(axis=0)
-    noise = rates[at_rest].std(axis=0, ddof=1)[column]
+    noise = float(rates[at_rest].std(axis=0, ddof=1)[column])
     step_s = float(np.diff(times).mean()) * 1e-9
-    net = (rates[moving] - zero) * step_s
-    angle = np.concatenate([[0.0], np.cumsum(net[:, column])]) * sign
-    moments = np.concatenate([[times[moving][0] - round(step_s * 1e9)], times[moving]])
-    during = [state for state in states if moments[0] <= state.time_ns <= moments[-1]]
-    state_ns = np.array([state.time_ns for state in during])
-    position = np.array([direction * state.position_deg for state in during])
-    gyro_deg = np.interp(state_ns, moments, angle)
-    rate_dps = np.interp(state_ns, times, (rates[:, column] - zero[column]) * sign)
-    start = np.mean([direction * state.position_deg for state in states if state.time_ns < before_ns])
-    rotation = float(position[-1] - start)
-    # The whole rotation gives the scale of the gyro relative to the encoder. The remaining difference during it is the
-    # delay.
-    scale = rotation / float(angle[-1]) if angle[-1] else 1.0
-    cruising = np.abs(rate_dps) > MIN_RATE_DPS
-    span_s = float(moving.sum()) * step_s
-    sigma = float(noise) * sqrt(step_s * span_s + (step_s * span_s**2) / (float(at_rest.sum()) * step_s))
-    return RecordedMove(
-        rotation, net.sum(axis=0), sigma, (position - start - scale * gyro_deg)[cruising], rate_dps[cruising]
-    )
+    # The noise of the rotation itself, and that of the zero from the rest before, over the same time.
+    span_s, rest_s = float(moving.sum()) * step_s, float(at_rest.sum()) * step_s
+    sigma_deg = noise * sqrt(step_s * span_s + step_s * span_s**2 / rest_s)
+    return RecordedMove((rates[moving] - rates[at_rest].mean(axis=0)).sum(axis=0) * step_s, sigma_deg)

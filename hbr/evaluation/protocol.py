@@ -165,8 +165,6 @@ class Protocol:
     enrolled: int | None = None
     """Number of enrolled views of each object, at equal distances; queries are taken from the other views. None: all
     views are enrolled, including the queries."""
-    absent: tuple[str, ...] = ()
-    """Names of objects that are not enrolled, to measure unknown objects; only with the dense filter."""
 
     def __post_init__(self) -> None:
         if self.trials < 1 or self.max_views < 1:
@@ -259,12 +257,12 @@ def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:
 
 
 def views_of_trial(views: Views, protocol: Protocol) -> NDArray[np.bool_]:
-    """Return which views are enrolled in all trials, bool (n,): all except those of absent objects."""
-    mask = ~np.isin(views.object_index, [j for j, name in enumerate(views.object_names) if name in protocol.absent])
+    """Return which views are enrolled in all trials, bool (n,)."""
+    mask = np.ones(len(views), np.bool_)
     if protocol.enrolled is not None:
         for j in range(len(views.object_names)):
             rows = views.of(j)
-            mask[rows] &= views_enrolled(views.azimuth_deg[rows], protocol.enrolled)
+            mask[rows] = views_enrolled(views.azimuth_deg[rows], protocol.enrolled)
     return mask
 
 

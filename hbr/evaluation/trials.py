@@ -153,7 +153,6 @@ class _Trials:
         self._azimuth_deg = views.azimuth_deg[self._rows]
         name = views.object_names[object_index]
         self._enrolled = views_of_trial(views, protocol)
-        self._is_unknown = name in protocol.absent
         self._free = np.flatnonzero(~self._enrolled[self._rows]) if protocol.enrolled else np.arange(len(self._rows))
         if len(queries) != len(self._rows):
             raise ValueError(f"{len(queries)} queries for the {len(self._rows)} views of {name}; one each is needed")
@@ -193,8 +192,6 @@ class _Trials:
         if method.dense:
             self._run_dense(method, draws, runs, at)
             return
-        if self._protocol.absent:
-            raise ValueError(f"{method.label} cannot search for unknown objects; use methods of the dense filter")
         if method.hmm:
             self._run_hmm(method, draws, models, runs, at)
             return
@@ -309,10 +306,9 @@ class _Trials:
             runs.outcome[*at, n] = OUTCOMES.index(session.decision.outcome)
             if not ended and session.decision.outcome is not Outcome.CONTINUE:
                 ended = True
-                if self._object in objects:
-                    stated = pose(session.belief, self._object)
-                    enrolled_deg = self._azimuth_deg[keep]
-                    runs.stated[*at, n] = stated_pose(stated, float(self._azimuth_deg[newest]), enrolled_deg)
+                stated = pose(session.belief, self._object)
+                true_deg = float(self._azimuth_deg[newest])
+                runs.stated[*at, n] = stated_pose(stated, true_deg, self._azimuth_deg[keep])
             seen.append(following)
 
     def _verify(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> None:
@@ -367,7 +363,7 @@ class _Trials:
                 keep[self._ring[(place[seen] + 1) % len(self._ring)]] = False
             case "queries":
                 pass
-        if not keep.any() and not self._is_unknown:
+        if not keep.any():
             name = self._views.object_names[self._object]
             raise ValueError(
                 f"after {len(seen)} queries no view of {name} is left; use fewer views or removal 'queries'"

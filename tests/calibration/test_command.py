@@ -156,7 +156,7 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
     ]
     assert results[-1].evidence["intrinsics"] == results[-2].id
     pictures = [plots(result) for result in results]
-    assert [len(drawn) for drawn in pictures] == [1] * 6 + [3, 2]
+    assert [len(drawn) for drawn in pictures] == [1] * 6 + [2, 2]
     assert rig("calibrate", "report", "--out", "page.html").exit_code == 0
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.count("valid until") == len(results)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hbr import DenseIndex, Outcome, next_best_view, update_belief
+from hbr import DenseIndex, Outcome, next_best_view
 from hbr.core.angles import wrap180
 from hbr.dense.stopping import decide
 from hbr.evaluation.protocol import METHODS, OUTCOMES, Protocol, Runs, choose_methods
@@ -75,23 +75,6 @@ def test_queries_are_views_that_are_not_enrolled() -> None:
     assert (np.array(following) % 3 != 0).all()
     with pytest.raises(ValueError, match="16 views; for 16 queries"):
         run("dense-90", protocol=replace(PROTOCOL, max_views=16))
-
-
-def test_absent_objects_are_searched_for_among_the_others() -> None:
-    protocol = replace(PROTOCOL, absent=("object 2", "object 4"))
-    unknown, known = run("dense", 2, protocol), run("dense", 1, protocol)
-    assert (unknown.rank == 0).all()
-    assert np.isnan(unknown.pose_error_deg).all()
-    assert (known.rank == 1).all()
-    assert unknown.score.max() < known.score.min()
-    # the same scores as a filter of the other objects alone
-    trials = _Trials(2, QUERIES[VIEWS.of(2)], VIEWS, protocol, lambda: 0)
-    first = int(trials.draw(0).order[0])
-    others = VIEWS.select(np.isin(VIEWS.object_index, [0, 1, 3, 5]) & (VIEWS.azimuth_deg % 45 == 0))
-    belief = update_belief(QUERIES[VIEWS.of(2)[first]], 0.0, DenseIndex(others, omega=METHODS["dense"].omega))
-    assert unknown.score[0, 0, 0, 0] == pytest.approx(belief.scores().max())
-    with pytest.raises(ValueError, match="dense filter"):
-        run("hbr", 1, protocol)
 
 
 def test_oracle_has_a_larger_margin_than_a_fixed_step() -> None:
