@@ -8,11 +8,8 @@ import pytest
 
 from rig.bench.computer import Computer
 from rig.bench.hardware import CameraPlug
-from rig.catalog import Catalog
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.opencv_camera import OpenCvCamera
-from rig.events.events import Rejected
-from rig.plans.enroll import enroll
 from sim.camera import SimCapture
 from sim.computer import ComputerFiles
 from sim.frame_times import FPS
@@ -133,14 +130,3 @@ def test_meanwhile_does_not_slow_down_a_fast_camera(world: World) -> None:
         camera.capture(world.clock.now_ns(), lambda: calls.append(1))
     assert calls == []
     assert world.clock.now_ns() - begun_ns < 10 * 2.1 * PERIOD_NS + 1e8
-
-
-def test_enrollment_with_a_slow_camera_loses_no_gyro_samples(simulated, tmp_path: Path) -> None:
-    s = simulated()
-    s.operator.devices.camera.every = round(1.2 * FPS)  # 1.2 s a frame; the FIFO lasts for 0.85 s
-    s.operator.next_object = "lamp"
-    with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
-        events = list(enroll(s.bench, catalog, "lamp", views=6))
-    rejected = [reason for event in events if isinstance(event, Rejected) for reason in event.reasons]
-    assert len(rejected) <= 2, rejected  # until the camera's period is known
-    assert s.bench.imu.statistics.overflows <= 3

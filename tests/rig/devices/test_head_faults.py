@@ -11,7 +11,7 @@ from rig.core.errors import (
     RequestRejected,
 )
 from rig.devices.head.head import RigHead
-from rig.devices.head.link import HeadFrame, HeadLink, encode
+from rig.devices.head.link import HeadLink
 from rig.devices.head.protocol import (
     BAUD,
     PROTOCOL_VERSION,
@@ -47,7 +47,7 @@ def test_corrupt_frames_cost_samples_but_give_no_wrong_value(opened):
     start_ns = opened.clock.now_ns()
     opened.head.filters.append(lambda _to_head, byte: byte ^ 0x20 if rng.random() < 0.002 else byte)
     rates, times, lost = [], [], 0
-    for _ in range(50):
+    for _ in range(25):
         opened.clock.sleep(0.1)
         samples = opened.imu.read_samples()
         rates.append(samples.gyro_dps)
@@ -64,22 +64,6 @@ def test_corrupt_frames_cost_samples_but_give_no_wrong_value(opened):
     assert opened.imu.status.state is HeadState.ACTIVE  # a lost heartbeat is repeated in time
 
 
-@AVR_NIGHTLY
-def test_noise_in_both_directions_is_tolerated(opened):
-    rng = np.random.default_rng(2)
-    for _ in range(20):
-        opened.head.send(rng.bytes(60))
-        opened.head.babble(rng.bytes(60))
-        opened.clock.sleep(0.05)
-        opened.imu.read_samples()
-    opened.clock.sleep(0.5)
-    opened.imu.read_samples()
-    opened.clock.sleep(0.5)
-    assert opened.imu.read_samples().lost == 0
-    found = counters(opened)
-    assert found.malformed + found.crc_errors > 0
-
-
 def test_late_reply_answers_no_other_request():
     with opened_head(noise=NoiseModel.none()) as h:
         h.imu._cancel()
@@ -93,17 +77,6 @@ def test_late_reply_answers_no_other_request():
         h.clock.sleep(0.1)
         link.poll()
         assert link.request(Hello(PROTOCOL_VERSION), Identity).protocol == PROTOCOL_VERSION
-
-
-def test_repeated_request_is_carried_out_once(opened):
-    """A head knows a repetition by its number: it does not read the body again."""
-    link = opened.imu._link
-    opened.imu._cancel()
-    link.request(Light(200), Done)
-    link._connection.write(encode(HeadFrame(Light.ID, link._sequence, bytes([5]))))
-    opened.clock.sleep(0.05)
-    opened.head.catch_up()
-    assert opened.head.light == pytest.approx(200 / 255)
 
 
 @AVR_NIGHTLY
@@ -213,7 +186,7 @@ def test_sensor_is_set_up_again_after_a_brown_out(opened):
 
 
 @AVR_NIGHTLY
-@pytest.mark.parametrize("clocks", [1, 4, 9])
+@pytest.mark.parametrize("clocks", [1, 9])
 def test_stuck_bus_is_freed_without_losing_samples(opened, clocks):
     opened.clock.sleep(0.2)
     opened.imu.read_samples()

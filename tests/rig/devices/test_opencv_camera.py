@@ -1,9 +1,6 @@
 """The OpenCV camera driver: settings, choice of frames by their time, and errors of a camera."""
 
-import threading
-from collections.abc import Iterator
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -12,9 +9,7 @@ import pytest
 
 from rig.bench.hardware import camera_settings
 from rig.config import CameraConfig
-from rig.core.clock import SystemClock
 from rig.core.errors import DeviceFault, DeviceNotFound, DeviceSilent
-from rig.devices import opencv_camera, v4l2
 from rig.devices.opencv_camera import OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from sim.camera import SimCapture
@@ -109,15 +104,6 @@ def test_paced_source_uses_only_frames_after_a_wait(world: World, offset_ms: flo
         assert frame.exposed_ns < after_ns + 6 * PERIOD_NS
 
 
-def test_image_matches_its_stamp(world: World) -> None:
-    camera = OpenCvCamera(SimCapture(world), clock=world.clock)
-    teapot = camera.capture(world.clock.now_ns()).image_bgr
-    world.put(shelf()["dice"])
-    dice = camera.capture(world.clock.now_ns()).image_bgr
-    assert teapot.shape == dice.shape == (480, 640, 3)
-    assert (teapot != dice).mean() > 0.05
-
-
 # -- failures ---------------------------------------------------------------------------------------------------------
 
 
@@ -191,75 +177,7 @@ def test_opening_errors_name_the_cause(tmp_path: Path) -> None:
         open_capture("/dev/null")
 
 
-# -- recordings and streams -------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def stream() -> Iterator[tuple[str, list[float]]]:
-    """An MJPEG stream on the loopback whose brightness can be set: the one source here that runs in real time."""
-    level, stop = [40.0], threading.Event()
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-            self.end_headers()
-            while not stop.wait(1 / 30):
-                ok, jpeg = cv2.imencode(".jpg", np.full((120, 160, 3), int(level[0]), np.uint8))
-                assert ok
-                try:
-                    self.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg.tobytes() + b"\r\n")
-                except OSError:
-                    return
-
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}/video", level
-    stop.set()
-    server.shutdown()
-    server.server_close()
-
-
-@pytest.mark.realtime
-def test_network_stream_is_current_after_a_pause(
-    stream: tuple[str, list[float]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    url, level = stream
-    monkeypatch.setattr(opencv_camera, "TIMEOUT_S", 20.0)
-    clock = SystemClock()
-    settings = CameraConfig(exposure_us=None, gain=None, white_balance_k=None)
-    # The latency gives a busy computer time to read the buffered frames, so that a pause does not count as waiting.
-    monkeypatch.setattr(opencv_camera, "LATENCY_FRAMES", 12)
-    camera = OpenCvCamera(open_capture(url), clock=clock, settings=settings)
-    try:
-        assert camera.time_base is TimeBase.PACED
-        clock.sleep(0.5)  # frames pile up in the socket
-        level[0] = 200.0
-        frame = camera.capture(clock.now_ns())
-        assert frame.image_bgr.mean() == pytest.approx(200, abs=3)
-        assert frame.exposed_ns <= clock.now_ns()
-    finally:
-        camera.close()
-
-
 # -- focus and other controls --------------------------------------------------------------------------------------
-
-
-def test_fixed_lens_needs_no_focus(world: World) -> None:
-    class Fixed(SimCapture):
-        def get(self, prop: int) -> float:
-            return -1.0 if prop in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) else super().get(prop)
-
-        def set(self, prop: int, value: float) -> bool:
-            return prop not in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) and super().set(prop, value)
-
-    camera = OpenCvCamera(Fixed(world), clock=world.clock)
-    assert (camera.read_locks().focus, camera.read_locks().autofocus) == (None, None)
-    assert camera.rejected_settings == ()
 
 
 def test_drift_of_a_control_from_zero_is_noticed(world: World) -> None:
@@ -292,23 +210,10 @@ def test_gain_that_the_driver_remembers_is_read_back_as_it_was_set(world: World)
 
 
 def test_all_controls_that_the_camera_has_are_locked(world: World) -> None:
-    class Plain(SimCapture):
-        missing = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_BACKLIGHT, v4l2.EXPOSURE_DYNAMIC_FRAMERATE)
-
-        def get(self, prop: int) -> float:
-            return -1.0 if prop in self.missing else super().get(prop)
-
-        def set(self, prop: int, value: float) -> bool:
-            return prop not in self.missing and super().set(prop, value)
-
     settings = CameraConfig(sharpness=10, backlight_compensation=1, power_line_frequency=1)
     locks = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings).read_locks()
     assert (locks.gain, locks.sharpness, locks.backlight_compensation) == (0, 10, 1)
     assert (locks.power_line_frequency, locks.dynamic_frame_rate) == (1, False)
-    camera = OpenCvCamera(Plain(world), clock=world.clock)
-    locks = camera.read_locks()
-    assert (locks.gain, locks.backlight_compensation, locks.dynamic_frame_rate) == (None, None, None)
-    assert camera.rejected_settings == ()
 
 
 def test_pixel_format_is_chosen_or_configured(world: World) -> None:

@@ -10,7 +10,6 @@ from rig.devices.dynamixel import settings as permanent
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.dynamixel.settings import SettingDifference
 from rig.devices.servo import MotionProfile
-from rig.motion.turntable import Turntable
 from sim.devices import SimDevices
 from sim.noise import NoiseModel
 from sim.servo.models import MODELS
@@ -51,23 +50,6 @@ def devices() -> SimDevices:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_each_model_rotates_beyond_a_revolution_and_reads_its_state(model: str) -> None:
-    chosen = f"servo.model={model}"
-    devices = parts_of(chosen)
-    servo = servo_of(devices, chosen)
-    start = servo.read_state()
-    rotated = go(devices, servo, start.position_deg + 500.0)
-    state = servo.read_state()
-    assert rotated == pytest.approx(500.0, abs=servo.resolution_deg)
-    assert state.position_deg - start.position_deg == pytest.approx(500.0, abs=servo.resolution_deg)
-    assert (state.moving, state.in_position, state.hardware_errors) == (False, True, ())
-    assert state.voltage_v == pytest.approx(MODELS[model].supply_v, abs=0.1)
-    assert state.trajectory_deg == pytest.approx(state.position_deg, abs=servo.resolution_deg)
-    low_v, high_v = servo.limits.voltage_v
-    assert low_v < state.voltage_v < high_v
-
-
-@pytest.mark.parametrize("model", MODELS)
 def test_load_is_a_percentage_for_each_model(model: str) -> None:
     chosen = f"servo.model={model}"
     devices = parts_of(chosen)
@@ -101,23 +83,6 @@ def test_gear_converts_angles_and_rates_to_the_table(ratio: float, angle_deg: fl
     devices.world.clock.sleep(20.0)
     assert devices.world.shaft()[0] == pytest.approx(angle_deg, abs=servo.resolution_deg)
     assert servo.read_state().position_deg - start_deg == pytest.approx(angle_deg, abs=1.01 * servo.resolution_deg)
-
-
-def test_geared_bench_agrees_with_its_gyro(simulated) -> None:
-    geared = simulated("servo.gear_ratio=3.0", "table.zero_deg=60")
-    with Turntable(geared.bench) as table:
-        for angle in (90.0, -45.0):
-            move = table.goto(angle)
-            assert move.agrees
-            assert move.agreement is not None
-            assert geared.world.table_deg() == pytest.approx(angle, abs=0.6)
-
-
-def test_wrong_gear_ratio_disagrees_with_the_gyro() -> None:
-    devices = parts_of("servo.gear_ratio=3.0")
-    servo = servo_of(devices, "servo.gear_ratio=2.0")
-    start_deg = servo.read_state().position_deg
-    assert go(devices, servo, start_deg + 30.0) == pytest.approx(20.0, abs=0.2)
 
 
 def test_pan_servo_stays_within_one_revolution() -> None:

@@ -4,12 +4,9 @@ import errno
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rig.devices import v4l2
-from rig.devices.v4l2 import COMPRESSED, UNCOMPRESSED, VideoMode, choose_mode
-from tests.fuzzing import examples
+from rig.devices.v4l2 import VideoMode, choose_mode
 
 C920 = {
     b"YUYV": {(640, 480): [(1, 30), (1, 15)], (1920, 1080): [(1, 5)]},
@@ -71,27 +68,3 @@ def test_uncompressed_mode_is_chosen_if_it_is_fast_enough(monkeypatch, tmp_path)
     assert str(choose_mode(offered, 800, 600, 30, "MJPG")) == "640x480 at 30 frames/s (MJPG)"
     assert choose_mode((), 640, 480, 30) is None
     assert choose_mode([VideoMode("H264", 640, 480, 30)], 640, 480, 30) is None
-
-
-modes = st.builds(
-    VideoMode,
-    st.sampled_from((*UNCOMPRESSED, *COMPRESSED, "H264")),
-    st.sampled_from((320, 640, 1280)),
-    st.sampled_from((240, 480, 720)),
-    st.sampled_from((0.0, 5.0, 15.0, 30.0, 60.0)),
-)
-
-
-@examples(15)
-@given(st.lists(modes, max_size=8), st.sampled_from((320, 640, 1000)), st.sampled_from((5.0, 30.0)))
-def test_no_offered_mode_is_better_than_the_chosen_one(offered, width, fps):
-    chosen = choose_mode(offered, width, 480, fps)
-    for mode in offered:
-        if mode.fourcc == "H264":
-            continue
-        assert chosen in offered
-        away, best = (abs(m.width - width) + abs(m.height - 480) for m in (mode, chosen))
-        assert best <= away
-        if best == away and mode.fps >= fps:
-            assert chosen.fps == 0 or chosen.fps >= 0.9 * fps
-            assert chosen.fourcc in UNCOMPRESSED or mode.fourcc in COMPRESSED

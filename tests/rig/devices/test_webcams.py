@@ -142,11 +142,10 @@ class Decodes(ModelledWebcam):
         return super().set(prop, value)
 
 
-@pytest.mark.parametrize("fourcc", ["HEVC", "H264"])
-def test_a_format_that_opencv_does_not_convert_is_rejected_without_asking_for_it(world: World, fourcc: str) -> None:
+def test_a_format_that_opencv_does_not_convert_is_rejected_without_asking_for_it(world: World) -> None:
     capture = Decodes(world, WEBCAMS["elp_h265"])
-    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraConfig(fourcc=fourcc))
-    assert [(one.setting, one.asked) for one in camera.rejected_settings] == [("fourcc", fourcc)]
+    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraConfig(fourcc="HEVC"))
+    assert [(one.setting, one.asked) for one in camera.rejected_settings] == [("fourcc", "HEVC")]
     assert capture.asked is None
 
 
