@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from functools import partial
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
@@ -19,10 +20,9 @@ from rig.core.errors import ObjectNotFound, UsageError
 from rig.core.json_form import plain
 from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.calibration_board import HOME_MARK, boards, home_mark
-from sim.camera import CAMERA_DEVICE
 from sim.change import Change
 from sim.clock import PacedClock, VirtualClock
-from sim.computer import simulated_computer
+from sim.computer import SimComputer, simulated_computer
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
@@ -33,6 +33,7 @@ from sim.objects.solid import empty_platter
 from sim.optics import Optics
 from sim.world import SimObject, World
 
+_NO_FILES: Final = Path("/nonexistent")
 _UNPLUGGED_S: Final = 8  # long enough to see what the pages say
 _SHOWN_DEG: Final = 25.0  # most objects show their handle and their picture from there
 
@@ -242,7 +243,6 @@ def open_sim_bench(
             devices = wires.enter_context(SimDevices.connected(config, world, operator.backdrop))
         if operator.backdrop is not None:  # objects of another size do not fit into the frame
             devices.objects = operator.objects
-        capture = partial(getattr, devices, "camera")
         operator.devices, operator.faults = devices, Faults(devices)
         if on_fault:
             operator.faults.listeners.append(on_fault)
@@ -251,20 +251,8 @@ def open_sim_bench(
         devices.open_connections()
         operator.faults.schedule(*faults)
         # Assemble the bench, with a cable that is not wound up in a new world.
-        bench = assemble(
-            name,
-            config,
-            world.clock,
-            connection=devices.adapter,
-            reopen_serial=devices.reopen_adapter,
-            i2c_bus=devices.i2c.path,
-            capture=capture,
-            reopen_camera=devices.reopen_camera,
-            camera_node=devices.camera.node,
-            camera_device=lambda: CAMERA_DEVICE,
-            state=operator.state,
-            head_port=devices.head_port,
-        )
+        computer = SimComputer(_NO_FILES, devices, config)  # opening a bench looks for no other devices
+        bench = assemble(name, config, world.clock, computer, state=operator.state)
         if operator.state.load().table is None and bench.safety.fault is None:
             if bench.servo.revolution_deg < 360.0:  # with a gear, the servo alone does not know the table's angle
                 bench.safety.set_angle(world.table_deg())

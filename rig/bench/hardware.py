@@ -4,7 +4,7 @@ Decision: docs/decisions/0001.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
@@ -48,24 +48,8 @@ class HardwareBench(BenchKind):
             connections.callback(BenchLock(state_path, clock).close)
             computer = connections.enter_context(self.computer(config, options, seed))
             computer.require_unused(config.servo.port)
-            connection = computer.open_serial(config.servo.port, config.servo.baud)
-            connections.callback(connection.close)
-            plug = CameraPlug(computer, config.camera.source)
-            bench = assemble(
-                self.name,
-                config,
-                clock,
-                connection=connection,
-                reopen_serial=lambda: computer.open_serial(config.servo.port, config.servo.baud),
-                guardian=Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id),
-                i2c_bus=computer.i2c_path(config.imu.bus),
-                capture=plug.open,
-                reopen_camera=plug.open,
-                camera_node=plug.node,
-                camera_device=lambda: plug.device,
-                state=FileStore(state_path),
-                head_port=lambda: computer.open_serial(config.head.port, BAUD, "head"),
-            )
+            guardian = Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id)
+            bench = assemble(self.name, config, clock, computer, state=FileStore(state_path), guardian=guardian)
             bench.connections = connections.pop_all()
             return bench
 
@@ -89,25 +73,17 @@ def assemble(
     name: str,
     config: RigConfig,
     clock: Clock,
+    computer: Computer,
     *,
-    connection: SerialConnection,
-    reopen_serial: Callable[[], SerialConnection] | None = None,
-    guardian: Guardian | None = None,
-    i2c_bus: int | str,
-    capture: Callable[[], Capture],
-    reopen_camera: Callable[[], Capture] | None = None,
-    camera_node: Callable[[], object] = lambda: None,
-    camera_device: Callable[[], str | None] = lambda: None,
     state: StateStore,
-    head_port: Callable[[], SerialConnection] | None = None,
+    guardian: Guardian | None = None,
 ) -> Bench:
-    """Open the drivers on their connections, for simulated and real benches alike; IMU and camera at their first use.
+    """Open the drivers on a real or a simulated computer; IMU and camera at their first use.
 
     Nothing moves, and the torque stays as it is. `Bench.safety` then knows whether the table may move.
 
     Raises `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: a device is missing, is another one, or does not answer.
-    The caller closes the connections. `ConfigError`: the servo does not support the configuration, or does not reach
-    the table's limits.
+    `ConfigError`: the servo does not support the configuration, or does not reach the table's limits.
     """
     with ExitStack() as opened:
         trace: TraceWriter | None = None
@@ -118,16 +94,23 @@ def assemble(
         def traced(port: SerialConnection, device: Device = "servo") -> SerialConnection:
             return port if trace is None else TracedSerial(port, trace, device)
 
+        def servo_port() -> SerialConnection:
+            return computer.open_serial(config.servo.port, config.servo.baud)
+
         # Open the rig head and the servo.
+        connection = servo_port()  # before anything is switched on: another program may use it
+        opened.callback(connection.close)
         head: RigHead | None = None
         fault: RigError | None = None
-        if config.imu.connection == "head" and head_port is not None:
-            port = head_port
-            head = open_head(config, lambda: traced(port(), "head"), clock)
+        if config.imu.connection == "head":
+            head = open_head(
+                config, lambda: traced(computer.open_serial(config.head.port, BAUD, "head"), "head"), clock
+            )
             opened.callback(head.close)
             fault = head.switch_on(config.head)  # first, because the servo's supply may go through it
-        again = reopen_serial and (lambda: traced(reopen_serial()))
-        servo = open_servo(traced(connection), config.servo, clock, config.table.mode, again, guardian)
+        servo = open_servo(
+            traced(connection), config.servo, clock, config.table.mode, lambda: traced(servo_port()), guardian
+        )
         findings = servo.prepare(write=config.servo.write_settings)
         _check_reach(config, servo)
         if note := imu_kind(config.imu.model).note:
@@ -137,25 +120,26 @@ def assemble(
         def open_sensor() -> Imu:
             if head is not None:
                 return head
+            i2c_bus = computer.i2c_path(config.imu.bus)
             return open_imu(config.imu, i2c_bus if trace is None else TracedI2c(i2c_bus, trace), clock)
 
         def open_camera() -> Camera:
+            plug = CameraPlug(computer, config.camera.source)
             with ExitStack() as failed:
-                source = capture()
+                source = plug.open()
                 failed.callback(source.release)
-                device = camera_device()
                 camera = OpenCvCamera(
                     source,
                     clock=clock,
-                    settings=camera_settings(config, state, device),
+                    settings=camera_settings(config, state, plug.device),
                     name=f"camera {masked(config.camera.source)}",
-                    device=device,
-                    reopen=reopen_camera,
-                    node=camera_node,
+                    device=plug.device,
+                    reopen=plug.open,
+                    node=plug.node,
                 )
                 failed.pop_all()
             if config.camera.focus is None:
-                store_focus(state, device, camera.read_locks().focus)
+                store_focus(state, plug.device, camera.read_locks().focus)
             bench.findings += tuple(
                 f"camera: {n.setting} was set to {n.asked}, but the camera reports {n.reported}"
                 for n in camera.rejected_settings

@@ -7,6 +7,8 @@ import cv2
 import pytest
 
 from rig import Catalog, enroll
+from rig.bench import hardware
+from rig.bench.computer import Computer
 from rig.config import load_config
 from rig.events.events import Enrolled
 from rig.safety.supervisor import TableState
@@ -46,7 +48,9 @@ def test_new_camera_takes_the_views_of_an_enrollment(monkeypatch, tmp_path):
         vendor.open = lambda _serial_number: VendorCamera(devices.camera)
         monkeypatch.setitem(sys.modules, "vendor", vendor)
         page = run("\n".join(blocks("add-a-camera")))
-        page |= {"open_serial": lambda *_: devices.adapter, "SystemClock": lambda: world.clock}
+        monkeypatch.setattr(Computer, "open_serial", lambda *_: devices.adapter)
+        monkeypatch.setattr(hardware, "SystemClock", lambda: world.clock)
+        monkeypatch.setattr(hardware, "Guardian", lambda *_: None)  # it would guard a real port
         config = config.model_copy(update={"imu": config.imu.model_copy(update={"bus": devices.i2c.path})})
         options = page["VendorOptions"](serial_number="17")
         with (

@@ -14,6 +14,7 @@ from rig.events.events import Enrolled, Moved
 from rig.safety.saved_state import MemoryStore
 from rig.safety.supervisor import TableState
 from sim.bench import ShelfOperator
+from sim.computer import SimComputer
 from sim.devices import SimDevices
 from sim.motion import to_position, to_velocity
 from sim.objects.shelf import shelf
@@ -84,15 +85,9 @@ def stepper(monkeypatch, tmp_path):
 def test_servo_of_another_make_rotates_the_table_for_an_enrollment(stepper, tmp_path):
     world = World(seed=1)
     with SimDevices.connected(load_config(None, []), world) as devices:
-        bench = assemble(
-            "stepper",
-            stepper,
-            world.clock,
-            connection=SimpleNamespace(world=world),
-            i2c_bus=devices.i2c.path,
-            capture=lambda: devices.camera,
-            state=MemoryStore(),
-        )
+        computer = SimComputer(tmp_path / "no files", devices, stepper)
+        computer.open_serial = lambda *_: SimpleNamespace(world=world, close=lambda: None)
+        bench = assemble("stepper", stepper, world.clock, computer, state=MemoryStore())
         with bench, Catalog.open(tmp_path / "catalog", clock=bench.clock) as catalog:
             bench.placer = ShelfOperator(world, shelf())
             assert bench.safety.state is TableState.UNREFERENCED  # as the page says
