@@ -125,16 +125,16 @@ def sentence(text: str) -> str:
 MESSAGE = (
     "",
     "",
+    "@dataclass_transform(frozen_default=True)",
     "class HeadMessage:",
-    '    """A message: its id, and the layout of its body."""',
+    '    """A message, a frozen dataclass: its id, and the layout of its body."""',
     "",
-    "    __slots__ = ()",
     "    ID: ClassVar[int]",
     "    LAYOUT: ClassVar[Struct]",
     "",
-    '    def __init_subclass__(cls, number: int | None = None, layout: str = "") -> None:',
-    "        if number is not None:  # a dataclass with slots makes its class twice, the second time without arguments",
-    "            cls.ID, cls.LAYOUT = number, Struct(layout)",
+    "    def __init_subclass__(cls, number: int, layout: str) -> None:",
+    "        cls.ID, cls.LAYOUT = number, Struct(layout)",
+    "        dataclass(frozen=True)(cls)",
 )
 
 
@@ -146,7 +146,7 @@ def module(table: Table) -> str:
         "from dataclasses import dataclass",
         "from enum import IntEnum, IntFlag",
         "from struct import Struct",
-        "from typing import ClassVar, get_args",
+        "from typing import ClassVar, dataclass_transform, get_args",
         "",
         f"PROTOCOL_VERSION = {table['version']}",
         f"FIRMWARE = ({major}, {minor}, {patch})",
@@ -170,7 +170,7 @@ def module(table: Table) -> str:
         fields = message["fields"]
         layout = "<" + "".join(PY_FORMATS[kind] for _, kind, _ in fields)
         kind = f'HeadMessage, number=0x{message["id"]:02X}, layout="{layout}"'
-        lines += ["", "", "@dataclass(frozen=True, slots=True)", f"class {camel(message['name'])}({kind}):"]
+        lines += ["", "", f"class {camel(message['name'])}({kind}):"]
         lines += [f'    """{message["doc"]}"""', *([""] if fields else [])]
         for name, _, doc in fields:
             field = f"    {name}: int" + " = 0" * name.startswith("pad_")

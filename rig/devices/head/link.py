@@ -7,7 +7,7 @@ import termios
 from binascii import crc_hqx
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from typing import TypeVar
 
 from cobs import cobs
@@ -286,7 +286,7 @@ class HeadLink:
         `RequestRejected`: the head rejected the request; the error says why.
         """
         self._sequence = (self._sequence + 1) % 256
-        frame = encode(HeadFrame(message.ID, self._sequence, message.LAYOUT.pack(*astuple(message))))
+        frame = encode(HeadFrame(message.ID, self._sequence, message.LAYOUT.pack(*vars(message).values())))
         reply_bytes = protocol.REPLIES.get(type(message), Done).LAYOUT.size + OVERHEAD
         for attempt in range(attempts):
             self.statistics.retries += bool(attempt)

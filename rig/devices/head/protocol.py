@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from struct import Struct
-from typing import ClassVar, get_args
+from typing import ClassVar, dataclass_transform, get_args
 
 PROTOCOL_VERSION = 1
 FIRMWARE = (1, 1, 0)
@@ -100,26 +100,24 @@ class SampleFlag(IntFlag):
     EDGE = 1
 
 
+@dataclass_transform(frozen_default=True)
 class HeadMessage:
-    """A message: its id, and the layout of its body."""
+    """A message, a frozen dataclass: its id, and the layout of its body."""
 
-    __slots__ = ()
     ID: ClassVar[int]
     LAYOUT: ClassVar[Struct]
 
-    def __init_subclass__(cls, number: int | None = None, layout: str = "") -> None:
-        if number is not None:  # a dataclass with slots makes its class twice, the second time without arguments
-            cls.ID, cls.LAYOUT = number, Struct(layout)
+    def __init_subclass__(cls, number: int, layout: str) -> None:
+        cls.ID, cls.LAYOUT = number, Struct(layout)
+        dataclass(frozen=True)(cls)
 
 
-@dataclass(frozen=True, slots=True)
 class Hello(HeadMessage, number=0x01, layout="<B"):
     """Ask for the head's identity; the head answers any protocol version."""
 
     protocol: int  # Protocol version of the host.
 
 
-@dataclass(frozen=True, slots=True)
 class Heartbeat(HeadMessage, number=0x02, layout="<HIII"):
     """Heartbeat of the host. It has as many bytes as its reply, so that both take the same time on the wire."""
 
@@ -129,33 +127,28 @@ class Heartbeat(HeadMessage, number=0x02, layout="<HIII"):
     pad_2: int = 0
 
 
-@dataclass(frozen=True, slots=True)
 class Shutdown(HeadMessage, number=0x03, layout="<"):
     """Switch the outputs and the deadman off, and end the stream."""
 
 
-@dataclass(frozen=True, slots=True)
 class Acknowledge(HeadMessage, number=0x04, layout="<B"):
     """Clear latched faults whose cause is gone."""
 
     faults: int  # The faults that the operator has seen; others stay.
 
 
-@dataclass(frozen=True, slots=True)
 class Light(HeadMessage, number=0x05, layout="<B"):
     """Set the ring light."""
 
     level: int  # Duty in 1/255; 0 is off.
 
 
-@dataclass(frozen=True, slots=True)
 class Relay(HeadMessage, number=0x06, layout="<B"):
     """Close or open the servo-power relay."""
 
     closed: int  # 0 or 1.
 
 
-@dataclass(frozen=True, slots=True)
 class SetImu(HeadMessage, number=0x08, layout="<BBBBB"):
     """Set up the sensor; `status_changed` and each `heartbeat_reply` report the result."""
 
@@ -166,26 +159,22 @@ class SetImu(HeadMessage, number=0x08, layout="<BBBBB"):
     range: int  # MPU-6050: FS_SEL, 0 to 3.
 
 
-@dataclass(frozen=True, slots=True)
 class Stream(HeadMessage, number=0x09, layout="<B"):
     """Start or stop sending samples."""
 
     on: int  # 0 or 1.
 
 
-@dataclass(frozen=True, slots=True)
 class ReadCounters(HeadMessage, number=0x0A, layout="<"):
     """Ask for the counters of errors since the start."""
 
 
-@dataclass(frozen=True, slots=True)
 class SetSerial(HeadMessage, number=0x0B, layout="<I"):
     """Store the serial number in permanent memory, but not while the head is active. Since firmware 1.1."""
 
     serial: int  # Serial number; serial_unset removes it.
 
 
-@dataclass(frozen=True, slots=True)
 class Done(HeadMessage, number=0x80, layout="<BB"):
     """The request was carried out or rejected; also the reply to unknown requests."""
 
@@ -193,7 +182,6 @@ class Done(HeadMessage, number=0x80, layout="<BB"):
     rejection: int  # Rejection; 0 if it was carried out.
 
 
-@dataclass(frozen=True, slots=True)
 class Identity(HeadMessage, number=0x81, layout="<BBBBBBBII"):
     """Identity of the head."""
 
@@ -208,7 +196,6 @@ class Identity(HeadMessage, number=0x81, layout="<BBBBBBBII"):
     uptime_us: int  # Time since the start; wraps with the clock.
 
 
-@dataclass(frozen=True, slots=True)
 class HeartbeatReply(HeadMessage, number=0x82, layout="<IIBBBBBB"):
     """Two times of the head's clock, and its status."""
 
@@ -222,7 +209,6 @@ class HeartbeatReply(HeadMessage, number=0x82, layout="<IIBBBBBB"):
     light: int  # Duty in 1/255.
 
 
-@dataclass(frozen=True, slots=True)
 class Counters(HeadMessage, number=0x8A, layout="<HHHHHHHHHH"):
     """Counters since the start; they stop at 65535."""
 
@@ -238,7 +224,6 @@ class Counters(HeadMessage, number=0x8A, layout="<HHHHHHHHHH"):
     restarts: int  # Sensor set up again.
 
 
-@dataclass(frozen=True, slots=True)
 class Sample(HeadMessage, number=0xC0, layout="<HIBBhhhhhhh"):
     """One sample of the sensor."""
 
@@ -255,7 +240,6 @@ class Sample(HeadMessage, number=0xC0, layout="<HIBBhhhhhhh"):
     gyro_z: int
 
 
-@dataclass(frozen=True, slots=True)
 class StatusChanged(HeadMessage, number=0xC1, layout="<IBBBBBB"):
     """The state, a fault, the e-stop or the sensor changed; also the first message after a start."""
 

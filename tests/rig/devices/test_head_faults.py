@@ -95,8 +95,8 @@ def test_reply_that_arrived_while_the_computer_was_busy_is_accepted(opened, monk
 
 
 def test_unknown_message_is_rejected(opened):
-    class Future(Light):
-        ID = 0x55
+    class Future(Light, number=0x55, layout="<B"):
+        pass
 
     with pytest.raises(RequestRejected, match="does not know this request"):
         opened.imu._link.request(Future(1), Done)
