@@ -1,7 +1,6 @@
 """A bench: servo, IMU, camera and table together, opened by name."""
 
 from rig.bench.bench import (
-    GROUP,
     Bench,
     BenchKind,
     Placer,
@@ -14,7 +13,6 @@ from rig.bench.bench import (
 )
 
 __all__ = [
-    "GROUP",
     "Bench",
     "BenchKind",
     "Placer",

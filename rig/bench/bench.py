@@ -4,12 +4,13 @@ Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,10 +21,12 @@ from rig.bench.computer import Computer
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
 from rig.calibrations.store import CALIBRATIONS
 from rig.config import RigConfig
-from rig.config.values import Values, config_mistakes, validate
+from rig.config.toml_file import changed_lines, read_text, save, with_values
+from rig.config.values import Values, config_mistakes, parsed, read_values, validate
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError, TorqueStaysOn
-from rig.core.next_steps import NextSteps
+from rig.core.masking import masked
+from rig.core.next_steps import Do, NextSteps
 from rig.core.notify import notify
 from rig.core.signals import uninterrupted
 from rig.devices.camera import Camera
@@ -126,12 +129,7 @@ class Bench(AbstractContextManager["Bench"]):
         """Switch the torque off and close all devices, even if one of them fails; a second call does nothing."""
         if not self._open:
             return
-        with uninterrupted():
-            self._open = False
-            self._close()
-
-    def _close(self) -> None:
-        failures: list[Exception] = []
+        # The torque first, whatever fails later. The trace last: it records how the others are closed.
         steps: list[Callable[[], object]] = [
             self.servo.torque_off,
             partial(self.safety.end_session, self._end),
@@ -140,20 +138,21 @@ class Bench(AbstractContextManager["Bench"]):
             self.connections.close,
             *((self.trace.close,) if self.trace else ()),
         ]
-        for step in steps:
-            try:
-                step()
-            except (RigError, OSError) as failure:
-                if isinstance(failure, TorqueStaysOn):
-                    self.safety.latch(failure)
-                if not (step == self.servo.torque_off and self._unpowered()):
-                    failures.append(failure)
+        failures: list[Exception] = []
+        with uninterrupted():  # a second Ctrl+C must not leave the torque on
+            self._open = False
+            for step in steps:
+                try:
+                    step()
+                except (RigError, OSError) as failure:
+                    if isinstance(failure, TorqueStaysOn):
+                        self.safety.latch(failure)
+                    # A servo whose supply the rig head's relay cuts does not answer, and has no torque either.
+                    powered = self.head is None or not self.config.head.power or self.head.status.relay_closed
+                    if powered or step != self.servo.torque_off:
+                        failures.append(failure)
         if failures:
             raise failures[0]
-
-    def _unpowered(self) -> bool:
-        """Return whether the rig head's relay cuts the servo's supply: then it has no torque either."""
-        return self.head is not None and self.config.head.power and not self.head.status.relay_closed
 
     def place(self, name: str | None) -> None:
         """Let the placer put an object on the table, as `Placer.place`; without a placer, it is there already."""
@@ -350,3 +349,25 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
     if found:
         raise config_mistakes(found, where)
     return config, options
+
+
+def set_key(target: Path, key: str, value: str, overrides: Iterable[str] = ()) -> list[str]:
+    """Set a key in a file to a value as in TOML, and return the changed lines; comments and other keys stay.
+
+    Raises `ConfigError`: there is no such key, or the configuration would have mistakes.
+    """
+    there = target.exists()
+    old = read_text(target) if there else ""
+    try:
+        check_config(read_values(target if there else None, [*overrides, f"{key}={value}"]))
+    except ConfigError as error:
+        raise ConfigError(
+            f"{target} is unchanged: it would have mistakes.",
+            next_step=("Give another value. To choose one,", Do.SHOW_CONFIGURATION()),
+            evidence=error.evidence,
+        ) from error
+    new = with_values(old, {tuple(key.split(".")): parsed(value)})
+    if new != old:
+        save(target, new)
+    changed: list[str] = masked(changed_lines(old, new))
+    return changed

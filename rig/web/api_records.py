@@ -7,7 +7,7 @@ from fastapi import Body, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import AwareDatetime, BaseModel, Field
 
-from rig.bench.changes import set_key
+from rig.bench.bench import set_key
 from rig.calibrations import CalibrationStore
 from rig.calibrations.result import CalibrationResult, Contribution
 from rig.config import RigConfig

@@ -9,7 +9,7 @@ import typer
 from pydantic import BaseModel
 
 from rig.bench import check_config
-from rig.bench.changes import set_key
+from rig.bench.bench import set_key
 from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore, apparatus, apply_results
 from rig.cli.ui.command import Group
 from rig.cli.ui.settings import Settings
