@@ -283,6 +283,7 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
 
     Raises `ConfigError`: a calibration sets a value that the configuration does not allow.
     """
+    # Always from the configuration as it was opened: a calibration that was replaced must leave nothing behind.
     bench._as_opened = bench._as_opened or (bench.config, bench.findings)
     config, findings = bench._as_opened
     calibrations = store.on_bench(bench.apparatus(), bench.clock.utc())
@@ -302,8 +303,9 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
 
 def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:
     """Return the kind of bench called ``name``, and its options."""
+    # Report a misspelt section before anything is opened.
     for wrong in sorted(set(config.bench) - set(bench_names())):
-        bench_kind(wrong)  # report a misspelt section before anything is opened
+        bench_kind(wrong)
     kind = bench_kind(name)
     where = "the configuration"
     return kind, validate(kind.options, config.bench.get(name, {}), where=where, prefix=f"bench.{name}")
@@ -330,6 +332,7 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
 
     Raises `ConfigError`: the evidence lists all mistakes, including those in the benches' own sections.
     """
+    # Collect all mistakes, so that one correction of the file is enough.
     found: list[str] = []
     config, options = RigConfig(), {}
     where = str(read.path) if read.path else "the command line"

@@ -298,6 +298,7 @@ class Computer:
         there = path.absolute()
         while not there.exists():
             there = there.parent
+        # The mount with the longest path holds it.
         mounts = [line.split() for line in self._text("/proc/mounts").splitlines()]
         holding = [m for m in mounts if len(m) > 2 and there.is_relative_to(m[1].replace("\\040", " "))]
         kind = max(holding, key=lambda m: len(m[1]))[2] if holding else ""
@@ -396,6 +397,7 @@ class Computer:
     def _may_use(self, file: Path, status: os.stat_result) -> bool:
         if self.user == User.current():
             return os.access(file, os.R_OK | os.W_OK)  # also checks access control lists
+        # A simulated user, as the kernel decides: the first class that fits counts, also if another would allow more.
         shift = 6 if status.st_uid == self.user.uid else 3 if status.st_gid in self.user.gids else 0
         return self.user.uid == 0 or status.st_mode >> shift & 0o6 == 0o6
 
@@ -423,6 +425,7 @@ class Computer:
 
     def _usb(self, device: Path) -> dict[str, str]:
         """Return the USB device's description; empty if the port is not on USB."""
+        # The description is in a folder above that of the interface; how far depends on the driver.
         for folder in [(real := device.resolve()), *real.parents]:
             if (folder / "idVendor").is_file():
                 names = ("idVendor", "idProduct", "manufacturer", "product", "serial")

@@ -58,7 +58,7 @@ class HardwareBench(BenchKind):
         """Open only the servo, even if the disk cannot be written, because it must be possible to stop it."""
         clock = SystemClock()
         with ExitStack() as connections:
-            with suppress(StateNotStored):
+            with suppress(StateNotStored):  # BenchBusy is not suppressed: another program then stops its own bench
                 connections.callback(BenchLock(config.state_path(self.name), clock).close)
             computer = connections.enter_context(self.computer(config, options, seed))
             connections.enter_context(
@@ -146,7 +146,7 @@ def assemble(
             )
             return camera
 
-        # Connect the safety layer with the devices.
+        # Connect the safety layer with the devices: what the head does by itself must stop and latch the bench, too.
         bench = Bench(name, config, clock, servo, open_sensor, open_camera, findings=findings, state=state, head=head)
         bench.trace = trace
         bench.safety.connect()
@@ -177,10 +177,12 @@ class CameraPlug:
 
     def open(self) -> Capture:
         """Open the camera. Raises DeviceNotFound, and DeviceMismatch if the source is another camera now."""
+        # The first camera of the source is the bench's camera.
         if not self._opened:
             capture = self._computer.open_capture(self._source)
             self._opened, self.device = True, self._computer.camera_device(self._source)
             return capture
+        # Later, only this one.
         self._here = self._found()
         capture = self._computer.open_capture(self._here)
         now = self._computer.camera_device(self._here)
@@ -233,6 +235,7 @@ def _check_reach(config: RigConfig, servo: Servo) -> None:
     """Raise `ConfigError` if the table's limits exceed the servo's reach."""
     table, (low, high) = config.table, servo.reach_deg
     first, last = sorted(table.direction * limit + table.zero_deg for limit in table.limits_deg)
+    # A count of tolerance at each end: limits of whole revolutions are no multiples of it.
     if low - servo.resolution_deg <= first and last <= high + servo.resolution_deg:
         return
     reached = sorted(table.direction * (end - table.zero_deg) for end in (low, high))

@@ -106,6 +106,7 @@ class I2cRegisters:
         """
         failures: list[int] = []
         for attempt in range(ATTEMPTS + 1):
+            # Some controllers that hang work again when their device file is opened again: one more attempt.
             if attempt == ATTEMPTS:
                 if not controller_hangs(self.name, failures):
                     break
@@ -119,8 +120,9 @@ class I2cRegisters:
             except OSError as error:
                 failure = error
                 failures.append(error.errno or 0)
-                if error.errno == EBUSY:
+                if error.errno == EBUSY:  # no attempt can succeed
                     raise self._in_use() from error
+        # No attempt succeeded: say what to check, by the kind of the last failure.
         evidence = {"errno": failure.errno, "attempts": len(failures), "retries_so_far": self.statistics.retries}
         if controller_hangs(self.name, failures):
             raise ControllerHangs(

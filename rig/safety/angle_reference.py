@@ -232,7 +232,8 @@ class TableRecord:
             self._state.table, self._servo.identity, state.position_deg, condition, self._servo.revolution_deg
         )
         self.angle_reference.shift_deg = check.shift_deg
-        # With other settings, the stored positions mean other angles.
+        # The servo may be certain of its angle, and the table not: with other settings, the stored positions mean other
+        # angles, and beyond the limits the cable is at risk.
         if check.finding is not AngleFinding.NEVER_REFERENCED and self._settings_changed():
             check = replace(check, finding=AngleFinding.SETTINGS_CHANGED)
         elif check.certain and self.beyond_limits(table_deg := self.angle_reference.to_table(state.position_deg)):
@@ -287,7 +288,7 @@ class TableRecord:
         latched = False
         try:
             self._store.latch(fault)
-            latched = fault is not None
+            latched = fault is not None  # then it survives, also if the state cannot be written
             self._save(state)
         except StateNotStored:
             if not latched:
@@ -297,6 +298,6 @@ class TableRecord:
                 self._state = state
 
     def _save(self, state: BenchState) -> None:
-        if state != self._state:
+        if state != self._state:  # a write waits for the disk
             self._store.save(state)
             self._state = state

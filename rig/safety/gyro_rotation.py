@@ -200,10 +200,12 @@ class GyroRotationMeter:
             raise UsageError(
                 f"A rest of {duration_s:g} s is not possible.", next_step=f"Give up to {MEMORY_S / 2:g} s, above 0."
             )
+        # An interrupted rotation has no end: what was measured of it counts for nothing.
         if self._moving:
             self._drain()
             self._moving, self._resting_ns = False, self._clock.now_ns()
             self._restart()
+        # Its mean is the bias, if nothing shakes and no part has this bias.
         rate = self._wait_for_rest(duration_s, meanwhile)
         mean = float(rate.mean())
         peak = float(np.abs(rate - mean).max())
@@ -215,7 +217,7 @@ class GyroRotationMeter:
                 next_step="Wait until the table stands still. If it shakes, use a steadier bench.",
                 evidence={"mean_dps": mean, "peak_dps": peak, "peak_limit_dps": REST_PEAK_DPS},
             )
-        if self.bias is None:
+        if self.bias is None:  # before the first bias, there was nothing to measure a rotation with
             self._restart()
         self.bias = Bias(mean, self._noise(rate) / sqrt(rate.size / self._imu.rate_hz), peak, rate.size)
         return self.bias
@@ -254,6 +256,7 @@ class GyroRotationMeter:
             raise NotReady("No rotation was begun.", next_step="Call `begin` before the move.")
         self._drain()
         rotation = self.since_rest()
+        # The next rotation counts from here, so that a slip between two moves is part of it.
         self._moving = False
         self._resting_ns = self._clock.now_ns()
         self._restart()
@@ -318,8 +321,9 @@ class GyroRotationMeter:
 
     def _check_repetition(self, gyro_dps: NDArray[np.float64]) -> None:
         """Raise `DeviceFault` if the sensor repeats one sample (other than zeros): noise would change it."""
-        if not len(gyro_dps) or self._saturated_dps > FINE_DPS:
+        if not len(gyro_dps) or self._saturated_dps > FINE_DPS:  # with coarse steps, a still sensor repeats itself
             return
+        # How many equal samples end this reading, and those before it?
         newest = gyro_dps[-1]
         others = np.flatnonzero((gyro_dps != newest).any(axis=1))
         continues = not others.size and np.array_equal(newest, self._newest_dps)
@@ -327,6 +331,7 @@ class GyroRotationMeter:
             len(gyro_dps) - (int(others[-1]) + 1 if others.size else 0) + (self._repeated if continues else 0)
         )
         self._newest_dps = newest
+        # A simulated sensor without noise repeats zeros.
         if newest.all() and self._repeated >= max(HUNG_S * self._imu.rate_hz, HUNG_SAMPLES):
             ends = float(np.abs(newest).max()) >= self._saturated_dps
             raise DeviceFault(

@@ -194,6 +194,7 @@ class MotionMonitor:
 
     def _check_servo(self, state: ServoState) -> None:
         cause = find_servo_fault(state, self._config, self._limits)
+        # A dip of the supply must last, because starting motors cause short ones. All else stops the table at once.
         dip = isinstance(cause, SupplyOutOfRange)
         if cause is not None and (not dip or self._lasts("supply", True, state.time_ns, VOLTAGE_S)):
             raise cause
@@ -209,6 +210,7 @@ class MotionMonitor:
 
     def _stands_still(self, time_ns: int, angle_deg: float) -> bool:
         """Return whether the angle has not changed by more than its noise for `NO_PROGRESS_S`."""
+        # The readings since the table came near its present angle; the first one says how long that is ago.
         stood = self._stood
         if stood and abs(angle_deg - stood[0][1]) > self._standing_deg:
             stood.clear()

@@ -266,12 +266,12 @@ class FileStore:
 
     def latch(self, fault: LatchedFault | None) -> None:
         with storing(self._latch):
-            make_folder(self.path)
+            self.path.mkdir(parents=True, exist_ok=True)
             self._write_latch(fault)
 
     def _write_latch(self, fault: LatchedFault | None) -> None:
         text = b"" if fault is None else _FAULT.dump_json(fault, exclude=_DERIVED)
-        if fault is not None and len(text) >= LATCH_BYTES:
+        if fault is not None and len(text) >= LATCH_BYTES:  # what it is and the first steps fit in any case
             steps = tuple(step[:500] if isinstance(step, str) else step for step in fault.steps)
             text = _FAULT.dump_json(
                 replace(fault, detail=fault.detail[:500], steps=steps, evidence={}), exclude=_DERIVED
@@ -292,12 +292,12 @@ class FileStore:
 
     def save(self, state: BenchState) -> None:
         with storing(self._file):
-            make_folder(self.path)
-            if not self._latch_is_reserved():
+            self.path.mkdir(parents=True, exist_ok=True)
+            if not self._latch_is_reserved():  # its room is taken before the first motion
                 self._write_latch(state.fault)
             stored = state.with_checksum().model_dump_json(indent=1, exclude={"damage": True, "fault": _DERIVED})
             files.write(self._file, stored.encode())
-            if not self._used.exists():
+            if not self._used.exists():  # last: it says that there is a state to be missed
                 files.write(
                     self._used, f"This bench has been used. Its state is in the folder {self.path.name}.\n".encode()
                 )
@@ -336,7 +336,7 @@ class FileStore:
 
     def store_file(self, name: str, content: bytes) -> None:
         with os_errors_as(StateNotStored, f"{name} cannot be stored in {self.path}.", next_step=_MAKE_ROOM):
-            make_folder(self.path)
+            self.path.mkdir(parents=True, exist_ok=True)
             files.write(self.path / name, content)
 
     def remove_file(self, name: str) -> None:
@@ -388,11 +388,6 @@ def _fault_of_damage(damage: str) -> LatchedFault:
     )
 
 
-def make_folder(path: Path) -> None:
-    if not path.is_dir():
-        path.mkdir(parents=True, exist_ok=True)
-
-
 def storing(path: Path) -> AbstractContextManager[None]:
     """Raise `StateNotStored` if the system does not let the ``with`` block write to ``path``."""
     what = f"The bench's state cannot be written to {path}; the table may not move without it."
@@ -414,7 +409,7 @@ class BenchLock:
         if (server := holder(path / SERVER_FOLDER)) is not None and server.pid != os.getpid():
             raise busy(path, server)
         with storing(path / "lock"):
-            make_folder(path)
+            path.mkdir(parents=True, exist_ok=True)
             self._file: TextIO = open(path / "lock", "a+", encoding="utf-8", opener=no_follow)  # noqa: SIM115
         for attempt in range(LOCK_ATTEMPTS):
             if _try_lock(self._file):
@@ -423,6 +418,7 @@ class BenchLock:
                 self._file.close()
                 raise busy(path, holder(path))
             clock.sleep(0.02)  # another program may be reading who holds the lock
+        # For the message of the next program, and for `rig stop`.
         mine = Holder(
             pid=os.getpid(),
             command=this_command(),

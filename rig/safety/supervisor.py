@@ -139,9 +139,9 @@ class Safety:
         self.monitors: list[Callable[[], object]] = []
         """Called in each round of the control loop; each raises a `RigError` if its device stopped the bench."""
         self.observers: list[Callable[[ServoState], object]] = []
+        """Called with each reading of the servo in the control loop: for displays. They must not raise or wait."""
         self.fault_observers: list[Callable[[RigError], object]] = []
         """Hear of each fault that is latched; they must return at once."""
-        """Called with each reading of the servo in the control loop: for displays. They must not raise or wait."""
         self.restore_actions: list[Callable[[], object]] = []
         """Called first when a fault is acknowledged: each switches on again what its device switched off."""
 
@@ -182,7 +182,7 @@ class Safety:
 
         Raises `DeviceSilent`: the servo does not answer.
         """
-        self._store.listen()
+        self._store.listen()  # before anything else: from now on a stop must be heard
         # What the last program left: it may have been killed, with the torque on.
         condition = self._servo.read_condition()
         findings = [f"the bench's stored state is lost: {self._record.damage}"] if self._record.damage else []
@@ -205,9 +205,11 @@ class Safety:
         is latched. `MotionStopped`: the operator requested a stop. `DeviceMismatch`, `DeviceSilent`: after a lost
         connection, another servo answers, or none.
         """
+        # A request from while the torque was off is carried out: it ends what would move now, and nothing after it.
         if self._store.stop_requested():
             self._store.clear_stop()
             raise stopped()
+        # At rest the table may have been rotated by hand, or its servo unplugged or replaced.
         if self.state in (TableState.CONNECTED, TableState.UNREFERENCED, TableState.READY):
             try:
                 self._check_angle()
@@ -220,7 +222,7 @@ class Safety:
         self.require_ready()
         state = self._servo.read_state()
         self.check_servo(state)
-        self._record.save_position(state.position_deg)
+        self._record.save_position(state.position_deg)  # fails here, at rest, if the disk cannot be written
 
     def check_servo(self, state: ServoState) -> None:
         """Latch and raise a problem of the servo at rest: a hardware error, temperature, supply voltage."""
@@ -249,11 +251,11 @@ class Safety:
         this motion, for example while the plan paused; nothing moved. `StateNotStored`: the path cannot be stored;
         nothing moved.
         """
+        # Before: the path is on the disk, so that the next program knows where the servo may be if this one is killed.
         self.require_ready()
         self.check_stop_request()
         motion = Motion()
         path = [self.angle_reference.to_servo(angle) for angle in ends_deg]
-        # If the program is killed, the next one knows where the servo may be.
         self._record.save_position(path_deg=(min(path), max(path)))
         try:
             self._apply(StateEvent.START)
@@ -262,8 +264,9 @@ class Safety:
                 raise MotionStopped("The motion was interrupted.", next_step="Start it again.")
             self._apply(StateEvent.ARRIVE)
         except BaseException as symptom:
+            # Ended early, by anything, also Ctrl+C: stop first, then latch or remember why the angle is not known.
             with uninterrupted():
-                error = self._find_monitor_fault(symptom)
+                error = self._find_monitor_fault(symptom)  # the e-stop, and not the silence that follows from it
                 received = False
                 try:
                     received = stop()
@@ -271,7 +274,7 @@ class Safety:
                         error.add_note(
                             "The servo did not receive the stop: its watchdog stops the table, its torque stays on."
                         )
-                finally:
+                finally:  # also if the stop itself failed
                     if isinstance(error, RigError) and error.latches:
                         self.latch(error)
                     elif self.state is TableState.MOVING:
@@ -279,7 +282,7 @@ class Safety:
             if error is not symptom:
                 raise error from symptom
             raise
-        self._record.save_position(motion.position_deg)
+        self._record.save_position(motion.position_deg)  # at rest again: the path is no longer open
 
     def beyond_limits(self, table_deg: float) -> bool:
         """Return whether the table may not rest at an angle, because it exceeds the cable budget."""
@@ -287,6 +290,7 @@ class Safety:
 
     def set_goal(self, position_deg: float) -> None:
         """Give the servo a goal, moved into the table's limits. Nothing else in the program writes a goal."""
+        # The last guard of the cable: plans are checked before, but a goal must not depend on that.
         ends_deg = [self.angle_reference.to_servo(limit) for limit in self._config.table.limits_deg]
         self._servo.move_to(min(max(position_deg, min(ends_deg)), max(ends_deg)))
 
@@ -313,9 +317,9 @@ class Safety:
 
     def latch(self, error: RigError) -> None:
         """Latch a fault: nothing moves until it is acknowledged. An earlier fault stays."""
-        self._apply(StateEvent.LATCH)
+        self._apply(StateEvent.LATCH)  # first: it holds in this program whatever happens to the disk
         self._add_acknowledgement(error)
-        if self.fault is None:
+        if self.fault is None:  # the first fault is the cause, later ones often follow from it
             try:
                 self._record.save_fault(LatchedFault.of(error, self._clock.utc().isoformat(timespec="seconds")))
             except StateNotStored as not_stored:
@@ -356,11 +360,13 @@ class Safety:
             self._servo.reboot()
         else:
             self._servo.verify()
+        # The causes that show at rest must be gone.
         if cause := find_servo_fault(self._servo.read_state(), self._config.safety, self._servo.limits, again=True):
             self._add_acknowledgement(cause)
             raise cause
         for check in self.acknowledge_checks:
             check()
+        # On the disk first: a fault that could not be removed there must not be forgotten here.
         if self.state is TableState.FAULT:
             self._record.save_fault(None)
             self._apply(StateEvent.ACKNOWLEDGE)

@@ -126,6 +126,7 @@ class RigHead:
         name: str = "head",
         reopen: Callable[[], SerialConnection] | None = None,
     ) -> None:
+        # What the head has said of itself, and what the program knows of the connection.
         self._deadman_ms = round(1000 * deadman_s)
         self._clock = clock
         self._sensor = sensor
@@ -140,6 +141,7 @@ class RigHead:
         self._stream = SampleStream(sensor, clock, self._timing, self.statistics)
         self._heartbeat_ns = clock.now_ns()
         self._cancel: Callable[[], None] = lambda: None
+        # Open it; after any failure its outputs are off and its port is closed.
         try:
             self._link.greet()
             self._begin()

@@ -246,6 +246,7 @@ class HeadLink:
         Raises `DeviceNotFound`: nothing answers that uses the protocol. `FirmwareMismatch`: the head uses another
         version; the message says which side to update.
         """
+        # A board may restart when its port is opened, and an earlier program may have left half a frame.
         start_ns = self._clock.now_ns()
         while True:
             try:
@@ -262,6 +263,7 @@ class HeadLink:
                         f"flash PORT={self.name}.",
                         evidence={"baud": BAUD, **asdict(self.statistics)},
                     ) from silent
+        # Any version answers this request, so that the message can say which side is older.
         if found.protocol != PROTOCOL_VERSION:
             ours = ".".join(map(str, FIRMWARE))
             older = found.protocol < PROTOCOL_VERSION
@@ -295,6 +297,7 @@ class HeadLink:
             self._guarded(lambda: self._connection.write(frame))
             deadline_ns = self.sent_ns + round(REPLY_S * 1e9)
             is_late = False
+            # Wait for the reply; frames of events in between are passed on, late replies dropped.
             while not is_late:
                 is_late = self._clock.now_ns() >= deadline_ns
                 if is_late:
