@@ -1,7 +1,7 @@
 """Seven real webcams, by what their USB descriptors say, and such a camera in front of the simulated scene.
 
-Numbers derived from the descriptors in espressif/esp-usb (eb461866, Apache-2.0); `tests/rig/devices/test_webcams.py`
-compares them with the files. The ranges of the controls are not in descriptors: those here are of other webcams.
+Numbers derived from the descriptors in espressif/esp-usb (eb461866, Apache-2.0). The ranges of the controls are not in
+descriptors: those here are of other webcams.
 """
 
 from dataclasses import dataclass, field

@@ -65,19 +65,6 @@ def test_adapter_unplugged_from_a_real_port_raises_device_silent():
     assert "port failed" in caught.value.evidence["reason"]
 
 
-def test_adapter_unplugged_while_draining_raises_device_silent(monkeypatch, wires, bus):
-    wires.bus.detach(wires.device)
-    drain = bus.port.drain
-
-    def pull_and_drain() -> None:
-        wires.serial.unplug()
-        drain()
-
-    monkeypatch.setattr(bus.port, "drain", pull_and_drain)
-    with pytest.raises(DeviceSilent, match="does not answer"):
-        bus.ping(1)
-
-
 def test_reply_to_an_interrupted_request_never_answers_the_next_one(wires, bus):
     """Ctrl+C interrupts a transaction, and torque off sends new requests; Protocol 2.0 has no sequence numbers."""
 

@@ -19,7 +19,6 @@ from rig.core.errors import (
 from rig.core.next_steps import Do
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import (
-    BAUD,
     DEADMAN_MAX_MS,
     DEADMAN_MIN_MS,
     PROTOCOL_VERSION,
@@ -37,6 +36,7 @@ from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone
 from sim.noise import NoiseModel
 from sim.world import World
 from tests.contract.heads import AVR_NIGHTLY, mpu6050, needs, simulated_head, switch_on
+from tests.rig.devices.scripted_serial import ScriptedSerial
 
 MS = 1_000_000
 
@@ -69,25 +69,9 @@ def test_version_mismatch_names_the_side_to_update(version, step):
 
 
 def test_port_without_head_raises_device_not_found():
-    class Deaf:
-        baudrate, in_waiting = BAUD, 0
-
-        def __init__(self, clock):
-            self.clock = clock
-
-        def read(self, size=1):
-            self.clock.sleep(0.002)
-            return b""
-
-        def write(self, data):
-            return len(data)
-
-        def reset_input_buffer(self): ...
-        def close(self): ...
-
     clock = VirtualClock()
     with pytest.raises(DeviceNotFound) as caught:
-        RigHead(Deaf(clock), clock, mpu6050(), name="/dev/ttyUSB7")
+        RigHead(ScriptedSerial(clock, ()), clock, mpu6050(), name="/dev/ttyUSB7")
     assert "PORT=/dev/ttyUSB7" in caught.value.next_step
     assert clock.now_ns() < 4e9
 

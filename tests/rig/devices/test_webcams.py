@@ -1,6 +1,5 @@
 """What seven real webcams show by their USB descriptors: formats, controls that lack, names and ids."""
 
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,35 +15,11 @@ from rig.devices.opencv_capture import OpenedCapture
 from rig.devices.v4l2 import CAPTURE, VideoMode, choose_mode
 from rig.doctor.device_scan import camera_settings
 from sim.world import World
-from tests.kernel.usb.video import Video
 from tests.rig.devices.test_v4l2 import driver
 from tests.rig.doctor.doctor_parts import unopened
-from tests.webcams import WEBCAMS, ModelledWebcam, WebcamModel, recorded
+from tests.webcams import WEBCAMS, ModelledWebcam
 
 META = 0x0080_0000
-
-
-def described(device: bytes, configuration: bytes) -> WebcamModel:
-    """Return what the descriptors of a device say."""
-    usb, ids, strings = device[2:4], device[8:12], zip("mps", device[14:17], strict=True)
-    video = Video.described(configuration)
-    formats: dict[str, list[str]] = {}
-    for mode in (mode for stream in video.streams.values() for mode in stream.modes.values()):
-        fps = round(1e7 / mode.shortest, 2)
-        formats.setdefault(mode.fourcc, []).append(f"{mode.width}x{mode.height}@{fps:g}")
-    return WebcamModel(
-        *struct.unpack("<H", usb),
-        *struct.unpack("<2H", ids),
-        "".join(letter for letter, index in strings if index),
-        video.camera[1],
-        video.processing[1],
-        {name: " ".join(sizes) for name, sizes in formats.items()},
-    )
-
-
-@pytest.mark.parametrize("name", WEBCAMS)
-def test_table_is_that_of_the_descriptors(name: str) -> None:
-    assert described(*recorded(name)) == WEBCAMS[name]
 
 
 class Sizes(dict[tuple[int, int], list[tuple[int, int]]]):
