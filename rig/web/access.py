@@ -176,13 +176,6 @@ class Tokens:
 
 
 @dataclass(slots=True)
-class _Session:
-    person: Person
-    sha256: str
-    since_ns: int
-
-
-@dataclass(slots=True)
 class Sessions:
     """Logins of browsers, in memory: after a restart, all users log in again."""
 
@@ -190,19 +183,19 @@ class Sessions:
     clock: Clock
     local_token: str = field(repr=False)
     """Lets commands of the same user on this computer watch; it ends with the server."""
-    _sessions: dict[str, _Session] = field(default_factory=dict)
+    _sessions: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """By the secret of a session: the hash of its token, and when it began."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def login(self, token: str) -> tuple[str, Person]:
         """Return the secret of a new session and its person; errors as `verify`."""
         stored = self.verify(token)
         secret = secrets.token_urlsafe(32)
-        person = Person(stored.name, stored.role)
         with self._lock:
             while len(self._sessions) >= MAX_SESSIONS:
                 del self._sessions[next(iter(self._sessions))]
-            self._sessions[secret] = _Session(person, stored.sha256, self.clock.now_ns())
-        return secret, person
+            self._sessions[secret] = stored.sha256, self.clock.now_ns()
+        return secret, Person(stored.name, stored.role)
 
     def verify(self, token: str) -> StoredToken:
         """Return the token that was given.
@@ -221,12 +214,12 @@ class Sessions:
     def find(self, secret: str) -> Person | None:
         """Return the person of a session; None if it has ended or its token was removed."""
         with self._lock:
-            session = self._sessions.get(secret)
-        if session is None or seconds_between(session.since_ns, self.clock.now_ns()) > SESSION_S:
-            return None
-        with suppress(ConfigError):  # the file is damaged
-            return session.person if self.tokens.valid(session.sha256) is not None else None
-        return None
+            sha256, since_ns = self._sessions.get(secret, ("", 0))
+        stored = None
+        if sha256 and seconds_between(since_ns, self.clock.now_ns()) <= SESSION_S:
+            with suppress(ConfigError):  # the file is damaged, and the last good one had no such token
+                stored = self.tokens.valid(sha256)
+        return None if stored is None else Person(stored.name, stored.role)
 
     def logout(self, secret: str) -> None:
         with self._lock:

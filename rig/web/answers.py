@@ -86,9 +86,8 @@ class JobMessage(RootModel[Annotated[Event | NoteMessage, Discriminator("event")
     """An event of the running job: the data of the messages ``plan`` of the stream, as JSON text.
 
     It also has ``job`` (the id) and ``text`` (the event in words), and if the operator should do something, ``steps``
-    as an error has them. ``accepted`` also has ``picture`` (the number of the
-    view in ``/jobs/{job_id}/views/{number}``) and ``outline_px`` of the object: ``box`` (x, y, width, height) and
-    ``points``, or null.
+    as an error has them. ``accepted`` also has ``picture``, the number of the view in
+    ``/jobs/{job_id}/views/{number}``.
     """
 
     model_config = DESCRIBED

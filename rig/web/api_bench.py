@@ -107,13 +107,13 @@ def add_access(routes: Routes, server: Server) -> None:
     @routes.public.get("/health", tags=["server"])
     def get_health() -> Health:
         """Return whether the server works; needs no login."""
-        return Health(version=version("hbr-rig"), bench_open=bool(server.remote.status.get("open")))
+        return Health(version=version("hbr-rig"), bench_open=bool(server.status.get("open")))
 
     @routes.public.post("/login", tags=["access"])
     def login(token: Annotated[str, Body(embed=True, max_length=200)], response: Response) -> Login:
         """Log in with a token; the answer sets a cookie."""
         secret, person = server.sessions.login(token)
-        secure = server.setup.listening.certfile is not None
+        secure = server.setup.certfile is not None
         response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=secure, path="/")
         return Login(name=person.name, role=person.role)
 
@@ -226,7 +226,7 @@ def add_bench(routes: Routes, server: Server) -> None:
     def get_status() -> Any:
         """Return the state of the bench, as of the last second."""
         return {
-            **server.remote.status,
+            **server.status,
             "bench": server.setup.bench,
             "server": {"listeners": server.hub.listeners},
             "catalog": server.catalog.state,
@@ -244,7 +244,7 @@ def add_bench(routes: Routes, server: Server) -> None:
     @routes.watch.post("/stop", tags=["bench"], response_model=Stopped)
     async def stop() -> Any:
         """Stop the table, and cancel all jobs. Needs no lease. The answer says whether the bench has confirmed it."""
-        return {**await server.remote.stop(), "status": server.remote.status}
+        return {**await server.stop(), "status": server.status}
 
     @routes.watch.get("/events", tags=["bench"], response_class=EventStream, responses={200: {"model": JobMessage}})
     async def stream_events(
@@ -270,7 +270,7 @@ def add_bench(routes: Routes, server: Server) -> None:
             while not sending.done():
                 received = await socket.receive_json()
                 if isinstance(received, dict) and "stop" in received and server.still_allowed(socket):
-                    done = await server.remote.stop()
+                    done = await server.stop()
                     await socket.send_json({"kind": "stopped", "data": {**done, "stop": received["stop"]}})
         except (WebSocketDisconnect, RuntimeError, ValueError):  # it is closed, or what came is not JSON
             pass
@@ -280,7 +280,7 @@ def add_bench(routes: Routes, server: Server) -> None:
     @routes.watch.get("/picture", tags=["bench"], response_class=Jpeg)
     async def get_picture() -> Jpeg:
         """Return the newest frame of the camera as JPEG; the header X-Rig-Picture-Age has its age in seconds."""
-        _, content, age_s = await server.remote.picture()
+        content, age_s = await server.picture()
         if not content:
             raise JobNotFound("The camera has given no frame yet.", next_step="Try again in a second.")
         return Jpeg(content, headers={"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"})
@@ -327,7 +327,7 @@ def add_jobs(routes: Routes, server: Server) -> None:
     @routes.watch.get("/jobs", tags=["jobs"], response_model=ListOf[Job])
     def list_jobs(page: Page, state: JobState | None = None) -> Response:
         """List the jobs, or those in one state, the newest first."""
-        jobs = [job for job in server.remote.call("jobs") if state in (None, job["state"])]
+        jobs = [job for job in server.bench.call("jobs") if state in (None, job["state"])]
         return page.of(jobs, lambda job: str(job["id"]))
 
     @routes.propose.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
@@ -342,50 +342,50 @@ def add_jobs(routes: Routes, server: Server) -> None:
         if isinstance(body, GotoRequest):  # it would fail later, behind the jobs that wait
             check_angle(body.angle_deg, server.setup.config.table.limits_deg)
         proposed = person.role is Role.PROPOSE
-        job = server.remote.call("submit", request=body, operator=person.name, key=idempotency_key, proposed=proposed)
+        job = server.bench.call("submit", request=body, operator=person.name, key=idempotency_key, proposed=proposed)
         response.headers["Location"] = f"{API}/jobs/{job['id']}"
         return job
 
     @routes.watch.get("/jobs/{job_id}", tags=["jobs"], response_model=Job)
     def get_job(job_id: str) -> Any:
         """Return a job."""
-        return server.remote.call("job", job_id=job_id)
+        return server.bench.call("job", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/approve", tags=["jobs"], response_model=Job)
     def approve_job(job_id: str, person: OperatorPerson) -> Any:
         """Approve a proposed job, which then waits for the bench."""
-        return server.remote.call("approve", job_id=job_id, operator=person.name)
+        return server.bench.call("approve", job_id=job_id, operator=person.name)
 
     @routes.operate.post("/jobs/{job_id}/cancel", tags=["jobs"], response_model=Job)
     def cancel_job(job_id: str) -> Any:
         """Cancel a job. A running one ends at its next step; views that were taken stay stored."""
-        return server.remote.call("cancel", job_id=job_id)
+        return server.bench.call("cancel", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/pause", tags=["jobs"], response_model=Job)
     def pause_job(job_id: str) -> Any:
         """Pause a job after its present view; the table holds its angle."""
-        return server.remote.call("pause", job_id=job_id)
+        return server.bench.call("pause", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/resume", tags=["jobs"], response_model=Job)
     def resume_job(job_id: str) -> Any:
         """Resume a paused job."""
-        return server.remote.call("resume", job_id=job_id)
+        return server.bench.call("resume", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/answer", tags=["jobs"], response_model=Job)
     def answer_job(job_id: str, body: AnswerBody) -> Any:
         """Answer the question of a job."""
-        return server.remote.call("answer", job_id=job_id, choice=body.choice, sample=body.sample)
+        return server.bench.call("answer", job_id=job_id, choice=body.choice, sample=body.sample)
 
     @routes.watch.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Jpeg)
     def get_job_view(job_id: str, number: int) -> Jpeg:
         """Return a picture of a recent job as JPEG, the first with number 0."""
-        found = server.remote.call("view", job_id=job_id, number=number)
+        found = server.bench.call("view", job_id=job_id, number=number)
         return Jpeg(b64decode(found), headers={"Cache-Control": "private, max-age=3600"})
 
     @routes.watch.get("/jobs/{job_id}/events", tags=["jobs"], responses={200: {"model": JobEvents}})
     def get_job_events(job_id: str) -> Response:
         """Return the events of a recent job so far, and the id after which a stream continues."""
-        server.remote.call("job", job_id=job_id)
+        server.bench.call("job", job_id=job_id)
         events, last = server.hub.of_job(job_id)
         content = f'{{"items": [{", ".join(events)}], "last": "{last}"}}'
         return Response(content, media_type="application/json", headers={"Cache-Control": "no-store"})
@@ -406,16 +406,16 @@ def add_shelf(routes: Routes, server: Server) -> None:
     @routes.watch.get("/shelf", tags=["bench"], response_model=ShelfState)
     def get_shelf() -> Any:
         """Return the objects of a simulated bench, and what is on its table."""
-        return server.remote.call("shelf")
+        return server.bench.call("shelf")
 
     @routes.operate.post("/shelf", tags=["bench"], response_model=ShelfState)
     def use_shelf(words: Words) -> Any:
         """Do something by hand at a simulated bench; the event `shelf` says what was done."""
-        return server.remote.call("by_hand", words=words)
+        return server.bench.call("by_hand", words=words)
 
     @routes.watch.get("/shelf/{name}", tags=["bench"], response_class=Jpeg)
     def get_thing(name: str) -> Jpeg:
         """Return a picture of an object of a simulated bench as JPEG."""
         return Jpeg(
-            b64decode(server.remote.call("thing", thing=name)), headers={"Cache-Control": "private, max-age=3600"}
+            b64decode(server.bench.call("thing", thing=name)), headers={"Cache-Control": "private, max-age=3600"}
         )

@@ -19,13 +19,13 @@ from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.facts import Action
 from rig.catalog.jobs import finished
 from rig.catalog.log import shown
-from rig.catalog.records import EnrollmentStatus, Provenance, RecordedOutcome
+from rig.catalog.records import EnrollmentStatus, Provenance, RecordedOutcome, Region
 from rig.catalog.results import Result, ResultFilter, ResultRow, correct, find_result, find_results
 from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
 from rig.events.events import SimilarObjects
 from rig.plans.enroll import similar_objects
-from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, within
 from rig.web.answers import Deleted, Jpeg, ListOf
 from rig.web.picture import jpeg
 from rig.web.requests import RequestBody
@@ -37,7 +37,7 @@ UPLOAD: Final = f"{API}/import"
 CHUNK_BYTES: Final = 65_536
 BYTES_PER_S: Final = 30_000_000
 Number = Annotated[int, Field(ge=0, lt=2**62)]
-Full = Annotated[bool, Query(description="the stored image instead of a small JPEG")]
+Full = Annotated[bool, Query(description="the image as it was stored, instead of a JPEG for the eye")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,24 +155,23 @@ def add_objects(routes: Routes, server: Server) -> None:
             catalog.undelete(name)
             return catalog.summary(name)
 
-    @routes.watch.get("/views/{view_id}/image", tags=["catalog"], response_class=Jpeg)
-    def get_view_image(request: Request, view_id: Number, full: Full = False) -> Response:
-        """Return the image of a view."""
-        with server.catalog.open_to_read() as catalog:
-            return _image(request, catalog, catalog.view(view_id).image, full=full)
 
+def sent_image(
+    request: Request, catalog: Catalog, name: str, *, full: bool, px: int, region: Region | None = None
+) -> Response:
+    """Return an image of the catalog, unless the sender has it already.
 
-def _image(request: Request, catalog: Catalog, name: str, *, full: bool) -> Response:
-    """Return an image of the catalog, unless the sender has it already."""
+    It is as it was stored if it shall be ``full``; else a JPEG of its ``region`` with at most ``px``.
+    """
 
     def answer() -> Response:
         pixels = catalog.read_image(name)  # and check them
         if full:
             kind = "image/png" if name.endswith(".png") else "image/jpeg"
             return Response(catalog.database.images.content(name), media_type=kind)
-        return Jpeg(jpeg(pixels, THUMB_PX))
+        return Jpeg(jpeg(within(pixels, region), px))
 
-    digest = f"{name}-{'full' if full else THUMB_PX}"
+    digest = f"{name}-{'full' if full else px}"
     return cached(request, digest, answer, {"Cache-Control": "private, max-age=86400"})
 
 
@@ -273,7 +272,7 @@ def add_results(routes: Routes, server: Server) -> None:
             name = _result(catalog, result_id).image
             if name is None:
                 raise JobNotFound("The answer has no image.", next_step="Set identify.record to image for later ones.")
-            return _image(request, catalog, name, full=full)
+            return sent_image(request, catalog, name, full=full, px=THUMB_PX)
 
     @routes.operate.post("/results/{result_id}/correct", tags=["results"])
     def correct_result(body: CorrectionBody, person: OperatorPerson, result_id: Number) -> ResultRow:

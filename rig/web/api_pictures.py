@@ -7,15 +7,14 @@ from pydantic import BaseModel
 
 from hbr.core.angles import wrap180
 from hbr.model.symmetry import extreme_pairs
-from rig.catalog import Catalog, View
 from rig.catalog.derived import views
 from rig.catalog.describing import described, silhouette
 from rig.core.errors import JobNotFound
 from rig.views.description import BENCH_DESCRIPTOR, within
 from rig.web.answers import Jpeg
-from rig.web.api_catalog import Number
-from rig.web.picture import jpeg, outlines_of
-from rig.web.server import Routes, Server, cached
+from rig.web.api_catalog import Full, Number, sent_image
+from rig.web.picture import outlines_of
+from rig.web.server import Routes, Server
 
 PICTURE_PX: Final = 720  # half of a tablet's screen; larger: a page with eight of them loads slowly
 Object = Annotated[str, Query(alias="object", max_length=100, description="name of an enrolled object")]
@@ -48,17 +47,12 @@ class Silhouette(BaseModel):
 
 
 def add_pictures(routes: Routes, server: Server) -> None:
-    def sent(request: Request, catalog: Catalog, view: View) -> Response:
-        def answer() -> Response:
-            return Jpeg(jpeg(within(catalog.read_image(view.image), view.region), PICTURE_PX))
-
-        return cached(request, f"{view.image}-{PICTURE_PX}", answer, {"Cache-Control": "private, max-age=86400"})
-
-    @routes.watch.get("/views/{view_id}/picture", tags=["catalog"], response_class=Jpeg)
-    def get_view_picture(request: Request, view_id: Number) -> Response:
-        """Return the region of a view that is described, as JPEG for the eye."""
+    @routes.watch.get("/views/{view_id}/image", tags=["catalog"], response_class=Jpeg)
+    def get_view_image(request: Request, view_id: Number, full: Full = False) -> Response:
+        """Return the region of a view that is described, as JPEG for the eye, or its whole image."""
         with server.catalog.open_to_read() as catalog:
-            return sent(request, catalog, catalog.view(view_id))
+            view = catalog.view(view_id)
+            return sent_image(request, catalog, view.image, full=full, px=PICTURE_PX, region=view.region)
 
     @routes.watch.get("/pose-picture", tags=["catalog"], response_class=Jpeg)
     def get_pose_picture(request: Request, object_name: Object, azimuth_deg: Azimuth = 0.0) -> Response:
@@ -67,7 +61,8 @@ def add_pictures(routes: Routes, server: Server) -> None:
             found = catalog.object(object_name).views
             if not found:
                 raise _not_enrolled(object_name)
-            return sent(request, catalog, min(found, key=lambda view: abs(wrap180(view.azimuth_deg - azimuth_deg))))
+            view = min(found, key=lambda view: abs(wrap180(view.azimuth_deg - azimuth_deg)))
+            return sent_image(request, catalog, view.image, full=False, px=PICTURE_PX, region=view.region)
 
     @routes.watch.get("/silhouette", tags=["catalog"])
     def get_silhouette(object_name: Object, index: Annotated[int, Query(ge=0, lt=10_000)]) -> Silhouette:

@@ -30,12 +30,6 @@ NOT_BY_PAGES: Final = ("camera.source",)
 RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
-class RunName(BaseModel):
-    """The name of a saved run."""
-
-    name: str
-
-
 class SavedRunBody(BaseModel):
     """The events of a saved run. Each also has ``text``: the event in words, empty if it has none."""
 
@@ -131,11 +125,11 @@ def add_records(routes: Routes, server: Server) -> None:
             raise JobNotFound("There is no run with that name.", next_step="Choose one of GET /api/v1/runs.")
         return load_run(server.setup.runs / name)
 
-    @routes.watch.get("/runs", tags=["runs"], response_model=ListOf[RunName])
+    @routes.watch.get("/runs", tags=["runs"], response_model=ListOf[str])
     def list_runs(page: Page) -> Response:
-        """List the saved runs, the newest first."""
+        """List the names of the saved runs, the newest first."""
         names = sorted((path.parent.name for path in server.setup.runs.glob("*/run.json")), reverse=True)
-        return page.of([RunName(name=name) for name in names if RUN_NAME.fullmatch(name)], lambda run: run.name)
+        return page.of([name for name in names if RUN_NAME.fullmatch(name)], str)
 
     @routes.watch.get("/runs/{name}", tags=["runs"], responses={200: {"model": SavedRunBody}})
     def get_run(name: str) -> Response:

@@ -88,7 +88,7 @@ def create_app(server: Server) -> FastAPI:
 
 def _numbers(server: Server) -> Iterator[str]:
     """Yield the numbers of the server as lines of the text format of Prometheus; what is not known is left out."""
-    status, numbers = server.remote.status, server.remote.call("numbers")
+    status, numbers = server.status, server.bench.call("numbers")
     servo = status.get("servo") or {}
     for name, kind, values in (
         ("bench_open", "gauge", {"": bool(status.get("open"))}),

@@ -6,12 +6,11 @@ the set-up as JSON on standard input.
 
 import asyncio
 import os
-import resource
 import signal
 import socket
 import sys
 import threading
-from typing import Any, Final
+from typing import Final
 
 import uvicorn
 from anyio import to_thread
@@ -22,10 +21,8 @@ from rig.web.app import create_app
 from rig.web.guard import Guard, PatientProtocol
 from rig.web.link import Link
 from rig.web.server import Server
-from rig.web.setup import WEB_NICE, Listening, Setup, set_priority, shorten_pauses
+from rig.web.setup import WEB_NICE, Setup, set_priority, shorten_pauses
 
-# each connection is a file; the usual limit of 1,024 is reached by a script that does not close them
-MAX_FILES: Final = 65_536
 THREADS: Final = 8
 """Threads for short requests. With more, STOP would wait longer for its turn of the interpreter."""
 SWITCH_S: Final = 0.001
@@ -36,9 +33,9 @@ END_S: Final = 4.0  # longer: `rig serve` ends later; shorter: requests that are
 
 def guarded(server: Server) -> Guard:
     """Return the application of a server behind its guard."""
-    listening = server.setup.listening
-    hosts = {"localhost", "127.0.0.1", "::1", listening.host.strip("[]"), *listening.other_hosts}
-    return Guard(create_app(server), hosts=hosts, upload_path=UPLOAD, max_upload_bytes=listening.max_upload_bytes)
+    setup = server.setup
+    hosts = {"localhost", "127.0.0.1", "::1", setup.host.strip("[]"), *setup.other_hosts}
+    return Guard(create_app(server), hosts=hosts, upload_path=UPLOAD, max_upload_bytes=setup.max_upload_bytes)
 
 
 class _Web(uvicorn.Server):
@@ -51,7 +48,6 @@ class _Web(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         to_thread.current_default_thread_limiter().total_tokens = THREADS
-        asyncio.get_running_loop().set_exception_handler(_log)
         await super().startup(sockets)
         self._living = asyncio.create_task(self._live())
 
@@ -61,16 +57,10 @@ class _Web(uvicorn.Server):
             await asyncio.sleep(SIGN_OF_LIFE_S)
 
 
-def _log(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log an error of the event loop, except that no file can be opened: asyncio repeats this many times a second."""
-    if context.get("message") != "socket.accept() out of system resource":
-        loop.default_exception_handler(context)
-
-
-def uvicorn_config(app: Any, listening: Listening) -> uvicorn.Config:
-    """Return the configuration of uvicorn."""
+def uvicorn_config(server: Server) -> uvicorn.Config:
+    """Return the configuration of uvicorn for a server."""
     config = uvicorn.Config(
-        app,
+        guarded(server),
         http=PatientProtocol,
         ws="websockets-sansio",
         ws_max_size=10_000,
@@ -82,8 +72,8 @@ def uvicorn_config(app: Any, listening: Listening) -> uvicorn.Config:
         server_header=False,
         timeout_keep_alive=15,
         timeout_graceful_shutdown=2,
-        ssl_certfile=listening.certfile,
-        ssl_keyfile=listening.keyfile,
+        ssl_certfile=server.setup.certfile,
+        ssl_keyfile=server.setup.keyfile,
         proxy_headers=False,
     )
     config.load()
@@ -93,10 +83,6 @@ def uvicorn_config(app: Any, listening: Listening) -> uvicorn.Config:
 def main(link_descriptor: int, socket_descriptor: int) -> None:
     """Serve until the bench's process ends the link, or a signal comes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the process that owns the bench
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(
-        resource.RLIMIT_NOFILE, (MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES), hard)
-    )
     set_priority(WEB_NICE)
     sys.setswitchinterval(SWITCH_S)
     setup = Setup.model_validate_json(sys.stdin.buffer.read())
@@ -107,8 +93,8 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
         threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
 
     server = Server(setup, SystemClock(), socket.socket(fileno=link_descriptor), ended)
-    web = _Web(uvicorn_config(guarded(server), setup.listening), server.remote)
-    server.remote.start()
+    web = _Web(uvicorn_config(server), server.bench)
+    server.bench.start()
     shorten_pauses()
     with server.catalog.background_delivery():
         web.run([socket.socket(fileno=socket_descriptor)])

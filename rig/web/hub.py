@@ -64,6 +64,7 @@ class Hub:
             self._last += 1
             self._messages.append(Message(self._last, kind, text, job))
             self._size += len(text)
+            # The newest message stays in any case: a listener that is up to date must get it.
             while len(self._messages) > self._capacity or (self._size > MAX_SIZE and len(self._messages) > 1):
                 self._size -= len(self._messages.popleft().data)
         self.wake()
@@ -114,7 +115,7 @@ class Hub:
         try:
             yield _hello(number, lost)
             while not self._closed and still_allowed():
-                changed = self._changed
+                changed = self._changed  # before the look: a message that comes after it wakes this listener
                 messages, lost = self.since(number)
                 if lost:
                     number = messages[0].number - 1
@@ -157,6 +158,7 @@ class Hub:
                 self._loop = None
 
     def _wake(self) -> None:
+        # Another event for the next message: clearing this one could let a listener miss it.
         if self._changed is not None:
             self._changed.set()
             self._changed = asyncio.Event()

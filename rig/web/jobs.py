@@ -85,7 +85,7 @@ class JobQueue:
         Raises `JobRejected`: too many jobs wait, or too large ones. `UsageError`: the key was that of another request.
         """
         with self._lock:
-            self.heed_stops()
+            self.heed_stops()  # a job that is submitted after a stop is not cancelled by it
             if key is not None and (earlier := self._submitted(operator, key)):
                 if earlier.request != request:
                     raise UsageError(
@@ -295,6 +295,7 @@ class JobQueue:
 
     def _store(self, *changed: Job) -> None:
         """Store all jobs, and report those that have changed."""
+        # Only what has changed is written as JSON again: a long tray takes milliseconds, and there are many.
         for job in changed:
             self._texts[job.id] = job.model_dump_json()
         self._drop_old()

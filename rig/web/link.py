@@ -1,40 +1,30 @@
 """The connection between the two processes of a server: the one that owns the bench, and the one that answers the web.
 
 Each end offers functions to the other one. A message is a line of JSON. Neither side ever waits for the other while it
-sends. `RemoteBench` is the end of the web process.
+sends.
 """
 
-import asyncio
 import json
 import socket
 import threading
-from base64 import b64decode
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from itertools import count
-from pathlib import Path
 from typing import Any, Final
 
 from pydantic import TypeAdapter
 from pydantic_core import to_jsonable_python
 
-from rig.core.clock import Clock, seconds_between
 from rig.core.errors import BenchBusy, Problem, RigError, error_of
 from rig.core.next_steps import Do
-from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
-from rig.web.answers import BenchStatus
 
 MAX_BYTES: Final = 64_000_000  # a longer line is no message of the other end
 MAX_UNSENT: Final = 20_000
 """Messages that wait for a web process that does not read. Then the oldest is dropped: a bench must not wait."""
 # longer: a request of a browser hangs with the bench; shorter: a busy computer looks like a dead one
 ANSWER_S: Final = 10.0
-PICTURE_S: Final = 0.08
-"""Shortest time between two pictures that are fetched from the bench, for all pages together."""
-CONFIRM_S: Final = 3.0
-"""How long a request to stop is held until the bench has confirmed it; the page warns after one second."""
 
 _PROBLEM: Final = TypeAdapter(Problem)
 Functions = Mapping[str, Callable[..., Any]]
@@ -93,7 +83,7 @@ class Link:
         with self._changed:
             self._closed = True
             self._changed.notify()
-        with suppress(OSError):
+        with suppress(OSError):  # ends the read and the write that wait; closing alone does not
             self._connection.shutdown(socket.SHUT_RDWR)
         for thread in self._threads:
             if thread is not threading.current_thread() and thread.ident is not None:
@@ -113,6 +103,7 @@ class Link:
                 if self._closed:
                     return
                 message = self._unsent.popleft()
+            # Outside of the lock: a bench that tells something must not wait until the other end reads.
             try:
                 self._connection.sendall(message)
             except OSError:
@@ -153,65 +144,3 @@ class Link:
 
 def _json_values(value: Any) -> Any:
     return to_jsonable_python(value, fallback=str)
-
-
-class RemoteBench(Link):
-    """The bench of another process: calls to the functions of `rig.web.worker.BenchWorker`, its events, and STOP.
-
-    ``received`` gets the kind and the values of each event, and the id of the job that it is of.
-    """
-
-    def __init__(
-        self,
-        connection: socket.socket,
-        state_folder: Path,
-        clock: Clock,
-        received: Callable[[str, Any, str | None], None],
-        ended: Callable[[], None],
-    ) -> None:
-        super().__init__(connection, {"publish": self._published}, ended)
-        self._state_folder = state_folder
-        self._clock = clock
-        self._take = received
-        self.status: dict[str, Any] = BenchStatus().model_dump()
-        """The last known state of the bench."""
-        self._newest: tuple[int, bytes] = (0, b"")
-        self._age_s: float | None = None
-        self._fetched_ns: int | None = None
-        self._fetching = asyncio.Lock()
-
-    def _published(self, kind: str, data: Any, job: str | None) -> None:
-        if kind == "status":
-            self.status = data
-        self._take(kind, data, job)
-
-    # -- STOP: it asks no queue, no thread and no disk ----------------------------------------------------------------
-
-    async def stop(self) -> dict[str, Any]:
-        """Stop the table and cancel all jobs; return what the bench has confirmed within `CONFIRM_S`."""
-        request = StopRequest(self._state_folder)
-        answer: StopAnswer | None = None
-        if request.connection is not None:
-            try:
-                async with asyncio.timeout(CONFIRM_S):
-                    answer = stop_answer(await asyncio.get_running_loop().sock_recv(request.connection, 1))
-            except TimeoutError:
-                pass
-            except OSError:
-                answer = StopAnswer.ENDED
-            finally:
-                request.close()
-        return {"ended": answer is StopAnswer.TORQUE_OFF, "answer": answer}
-
-    # -- the picture --------------------------------------------------------------------------------------------------
-
-    async def picture(self) -> tuple[int, bytes, float | None]:
-        """Return the number of the newest frame, the frame as JPEG (empty if there is none), and its age in seconds."""
-        async with self._fetching:
-            now_ns = self._clock.now_ns()
-            if self._fetched_ns is None or seconds_between(self._fetched_ns, now_ns) > PICTURE_S:
-                found = await asyncio.to_thread(self.call, "picture", after=self._newest[0])
-                self._fetched_ns, self._age_s = self._clock.now_ns(), found["age_s"]
-                if found["jpeg"]:
-                    self._newest = (found["number"], b64decode(found["jpeg"]))
-            return (*self._newest, self._age_s)

@@ -1,4 +1,4 @@
-"""Pictures for the pages: the newest frame, and the outline of the object in a view."""
+"""Pictures for the pages: the newest frame, and the outline of a silhouette."""
 
 from typing import Final
 
@@ -6,11 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench import Bench
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import RigError
-from rig.views.description import ViewSegmenter, within
-from rig.views.empty_table import empty_table_status
 
 JPEG_QUALITY: Final = 80  # for the eye only; no descriptor sees it
 MAX_SIDE_PX: Final = 1280  # the width of a page; more loads a slow network
@@ -64,36 +60,6 @@ def jpeg(image_bgr: NDArray[np.uint8], max_side_px: int = MAX_SIDE_PX) -> bytes:
     if not encoded:
         raise ValueError("the image cannot be encoded")
     return content.tobytes()
-
-
-class Outliner:
-    """The outlines of the object in the views of one job, with the segmentation of their descriptions."""
-
-    def __init__(self, bench: Bench) -> None:
-        self._region = bench.config.view.roi
-        status = empty_table_status(bench)
-        self._describer = ViewSegmenter(
-            bench.config.view, empty_table=None if status.table is None else status.table.image_bgr
-        )
-
-    def __call__(
-        self, image_bgr: NDArray[np.uint8], azimuth_deg: float
-    ) -> dict[str, list[list[int]] | list[int]] | None:
-        """Return ``box`` (x, y, width, height) and ``points`` in pixels of the frame; None if no object is found."""
-        try:
-            found = self._describer.segment(image_bgr, azimuth_deg)
-        except (RigError, ValueError):
-            return None
-        if found.box is None:
-            return None
-        x, y = (0, 0) if self._region is None else self._region[:2]
-        height, width = within(image_bgr, self._region).shape[:2]
-        outlines = outlines_of(found.frame_mask(width, height))
-        left, top, box_width, box_height = found.box
-        return {
-            "box": [left + x, top + y, box_width, box_height],
-            "points": [[px + x, py + y] for px, py in outlines[0]] if outlines else [],
-        }
 
 
 def outlines_of(mask: NDArray[np.bool_]) -> list[list[list[int]]]:

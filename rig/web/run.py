@@ -25,7 +25,7 @@ from rig.core.next_steps import Do
 from rig.core.notify import print_note
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, BenchLock, ServerAddress
 from rig.web.link import Link
-from rig.web.setup import BENCH_NICE, Listening, Setup, set_priority, shorten_pauses
+from rig.web.setup import BENCH_NICE, Setup, set_priority, shorten_pauses
 from rig.web.work import run_job
 from rig.web.worker import BenchWorker
 
@@ -49,22 +49,23 @@ def run_server(setup: Setup, ready: Callable[[str], None]) -> None:
     Raises `UsageError`: the address or the certificate cannot be used. `BenchBusy`: another server uses the bench.
     `WebEnded`: the web process ends again and again.
     """
-    clock, listening = SystemClock(), setup.listening
-    _check_certificate(listening)
+    clock = SystemClock()
+    _check_certificate(setup)
     folder = setup.state_folder / SERVER_FOLDER
     lock = BenchLock(folder, clock)  # one server for each bench
     set_priority(BENCH_NICE)
     try:
         worker = BenchWorker(setup, clock, run_job)
-        with _socket(listening) as connection:
+        with _socket(setup) as connection:
             web = WebProcess(worker, connection, clock)
             try:
                 web.start()
+                # Other commands of this user find the server by this file.
                 address = ServerAddress(
                     pid=os.getpid(),
-                    url=_url(listening, connection),
+                    url=_url(setup, connection),
                     token=setup.local_token,
-                    certificate=str(listening.certfile.absolute()) if listening.certfile else None,
+                    certificate=str(setup.certfile.absolute()) if setup.certfile else None,
                 )
                 write(folder / SERVER_FILE, address.model_dump_json().encode(), mode=0o600)
                 ready(address.url)
@@ -149,6 +150,7 @@ class WebProcess:
                 continue
             if self._closed.is_set():
                 return
+            # No page can show the table now, and what waits would begin without a person.
             self._worker.queue.hold()
             self._end()
             full = len(self._starts) == MAX_STARTS
@@ -175,23 +177,23 @@ class WebProcess:
             self._process = None
 
 
-def _check_certificate(listening: Listening) -> None:
+def _check_certificate(setup: Setup) -> None:
     step = "Check the files of the certificate and of its key: PEM, and the key without a passphrase."
-    if listening.certfile is not None:
+    if setup.certfile is not None:
         with os_errors_as(UsageError, "The certificate cannot be used.", next_step=step):
             context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-            context.load_cert_chain(listening.certfile, listening.keyfile, password=lambda: "")
+            context.load_cert_chain(setup.certfile, setup.keyfile, password=lambda: "")
 
 
-def _url(listening: Listening, connection: socket.socket) -> str:
-    scheme = "https" if listening.certfile else "http"
-    host = f"[{listening.host}]" if ":" in listening.host.strip("[]") else listening.host
+def _url(setup: Setup, connection: socket.socket) -> str:
+    scheme = "https" if setup.certfile else "http"
+    host = f"[{setup.host}]" if ":" in setup.host.strip("[]") else setup.host
     return f"{scheme}://{host}:{connection.getsockname()[1]}/"
 
 
-def _socket(listening: Listening) -> socket.socket:
-    host = listening.host.strip("[]")
+def _socket(setup: Setup) -> socket.socket:
+    host = setup.host.strip("[]")
     step = "Choose another port, or another host."
-    with os_errors_as(UsageError, f"The server cannot listen to {host}, port {listening.port}.", next_step=step):
+    with os_errors_as(UsageError, f"The server cannot listen to {host}, port {setup.port}.", next_step=step):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host, listening.port), family=family, backlog=128)
+        return socket.create_server((host, setup.port), family=family, backlog=128)

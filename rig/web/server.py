@@ -4,6 +4,7 @@ import asyncio
 import hashlib
 import secrets
 import socket
+from base64 import b64decode
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,19 +21,25 @@ from rig.catalog.copying import Attempts, open_or_copy
 from rig.catalog.journal import BackgroundDelivery, JournalState
 from rig.catalog.log import asked_by
 from rig.config.catalog_place import CatalogPlace
-from rig.core.clock import Clock, SystemClock
+from rig.core.clock import Clock, SystemClock, seconds_between
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.core.notify import print_note
 from rig.safety.saved_state import SERVER_FOLDER
+from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions, Tokens
+from rig.web.answers import BenchStatus
 from rig.web.hub import Hub
-from rig.web.link import RemoteBench
+from rig.web.link import Link
 from rig.web.setup import Setup
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"
 MAX_PAGE: Final = 500  # larger: a list holds the process that receives STOP for longer
+PICTURE_S: Final = 0.08
+"""Shortest time between two pictures that are fetched from the bench, for all pages together."""
+CONFIRM_S: Final = 3.0
+"""How long a request to stop is held until the bench has confirmed it; the page warns after one second."""
 
 
 class BenchCatalog:
@@ -81,9 +88,10 @@ class BenchCatalog:
 
 
 class Server:
-    """The objects that the application works with; nothing listens yet, and ``remote`` has to be started.
+    """The objects that the application works with; nothing listens yet, and the link ``bench`` has to be started.
 
-    ``connection`` leads to the process that owns the bench; ``ended`` is called once when that process has gone.
+    ``connection`` leads to the process that owns the bench, `rig.web.worker.BenchWorker`; ``ended`` is called once when
+    that process has gone.
     """
 
     def __init__(
@@ -91,10 +99,51 @@ class Server:
     ) -> None:
         self.setup = setup
         self.hub = Hub(secrets.token_hex(4))
-        self.remote = RemoteBench(connection, setup.state_folder, clock, self.hub.publish, ended)
+        self.bench = Link(connection, {"publish": self._published}, ended)
+        self.status: dict[str, Any] = BenchStatus().model_dump()
+        """The last known state of the bench."""
         self.sessions = Sessions(Tokens(setup.state_folder / SERVER_FOLDER, clock), clock, setup.local_token)
         self.lease = Lease(clock, lambda values: self.hub.publish("lease", values))
         self.catalog = BenchCatalog(setup.catalog_place, clock, self.hub)
+        self._clock = clock
+        self._picture: dict[str, Any] = {"number": 0, "jpeg": "", "age_s": None}
+        self._fetched_ns: int | None = None
+        self._fetching = asyncio.Lock()
+
+    def _published(self, kind: str, data: Any, job: str | None) -> None:
+        if kind == "status":
+            self.status = data
+        self.hub.publish(kind, data, job)
+
+    async def stop(self) -> dict[str, Any]:
+        """Stop the table and cancel all jobs; return what the bench has confirmed within `CONFIRM_S`.
+
+        It asks no queue, no thread and no disk.
+        """
+        request = StopRequest(self.setup.state_folder)
+        answer: StopAnswer | None = None
+        if request.connection is not None:
+            try:
+                async with asyncio.timeout(CONFIRM_S):
+                    answer = stop_answer(await asyncio.get_running_loop().sock_recv(request.connection, 1))
+            except TimeoutError:
+                pass
+            except OSError:
+                answer = StopAnswer.ENDED
+            finally:
+                request.close()
+        return {"ended": answer is StopAnswer.TORQUE_OFF, "answer": answer}
+
+    async def picture(self) -> tuple[bytes, float | None]:
+        """Return the newest frame as JPEG (empty if there is none), and its age in seconds."""
+        async with self._fetching:
+            now_ns = self._clock.now_ns()
+            if self._fetched_ns is None or seconds_between(self._fetched_ns, now_ns) > PICTURE_S:
+                found = await asyncio.to_thread(self.bench.call, "picture", after=self._picture["number"])
+                # The frame that is known already is not sent again.
+                self._picture |= found if found["jpeg"] else {"age_s": found["age_s"]}
+                self._fetched_ns = self._clock.now_ns()
+            return b64decode(self._picture["jpeg"]), self._picture["age_s"]
 
     def person(self, request: HTTPConnection) -> Person | None:
         """Return the sender of a request; None if it is not known.
@@ -102,6 +151,7 @@ class Server:
         Raises `LoginRequired`: its token is wrong. `ConfigError`: the file of the tokens is damaged.
         """
         # A browser cannot set headers of a web socket, so its page sends the client in the address.
+        # It is cut, because it is kept and sent to all pages.
         client = (request.headers.get("x-rig-client") or request.query_params.get("client", ""))[:64]
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
@@ -111,7 +161,7 @@ class Server:
             found = self.sessions.find(cookie)
             if found is not None:
                 return Person(found.name, found.role, client)
-        return None if self.setup.listening.needs_login else Person(LOCAL, Role.OPERATE, client)
+        return None if self.setup.needs_login else Person(LOCAL, Role.OPERATE, client)
 
     def still_allowed(self, request: HTTPConnection) -> bool:
         """Return whether the sender of a request that is still open may go on: the token may have been removed."""

@@ -17,22 +17,8 @@ BENCH_NICE: Final = -10
 WEB_NICE: Final = -5  # before other programs, because it receives STOP; after the bench, which obeys it
 
 
-class Listening(BaseModel):
-    """The address at which a server listens, and its allowed clients."""
-
-    model_config = ConfigDict(frozen=True)
-
-    host: str
-    port: int
-    other_hosts: tuple[str, ...] = ()
-    certfile: Path | None = None
-    keyfile: Path | None = None
-    needs_login: bool = False
-    max_upload_bytes: int = 500_000_000
-
-
 class Setup(BaseModel):
-    """The bench that is served and how to open it, and the address of the server.
+    """The bench that is served and how to open it, the address at which the server listens, and its allowed clients.
 
     ``config_file`` is the file that the pages change, if they can. ``arguments`` are the arguments of `rig` that
     select the same bench. ``local_token`` lets commands of the same user on this computer watch.
@@ -45,7 +31,13 @@ class Setup(BaseModel):
     config_file: Path | None = None
     seed: int | None = None
     arguments: tuple[str, ...] = ()
-    listening: Listening
+    host: str = "127.0.0.1"
+    port: int = 0
+    other_hosts: tuple[str, ...] = ()
+    certfile: Path | None = None
+    keyfile: Path | None = None
+    needs_login: bool = False
+    max_upload_bytes: int = 500_000_000
     local_token: str = Field(default_factory=new_token)
 
     @property

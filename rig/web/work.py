@@ -37,7 +37,7 @@ from rig.plans.tray import TrayItem
 from rig.views.description import within
 from rig.web import requests
 from rig.web.access import LOCAL
-from rig.web.picture import Outliner, jpeg
+from rig.web.picture import jpeg
 from rig.web.requests import Job, JobState, TrayObject
 from rig.web.worker import BenchWorker
 
@@ -74,7 +74,6 @@ class ServedDesk(Desk):
         self.setup = worker.setup
         self._worker = worker
         self._left: TimeLeft | None = None
-        self._outline: Outliner | None = None
 
     # -- what a job needs ---------------------------------------------------------------------------------------------
 
@@ -153,10 +152,10 @@ class ServedDesk(Desk):
     def show(self, event: Event) -> None:
         """Show an event; then pause or cancel the job if the operator asked for it."""
         job, values, text = self.job, event_dict(event), page_line(event)
+        # Count: views done, and the time that the others take.
         if isinstance(event, Started):
             bench = self._worker.bench()
             job.progress = requests.StepsDone(done=0, total=event.views)
-            self._outline = Outliner(bench)
             left = TimeLeft(MotionTimes(bench.config), event.angles_deg, in_motion=event.in_motion)
             self._left = left if event.angles_deg else None
         if self._left is not None:
@@ -164,16 +163,18 @@ class ServedDesk(Desk):
         if isinstance(event, Accepted):
             self._worker.views[job.id].append(jpeg(self._described(event.image_bgr), VIEW_PX))
             values["picture"] = job.views
-            values["outline_px"] = None if self._outline is None else self._outline(event.image_bgr, event.azimuth_deg)
             job.views += 1
             if job.progress is not None:
                 left_s = None if self._left is None else self._left.seconds
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
+        # Tell: the event itself, and the job where it has changed. The first view is stored, because from then on the
+        # job can be continued after a kill.
         if isinstance(event, Enrolled | Identified):
             job.result, job.result_text = event, text
         self._publish(text, next_steps(event), values)
         if isinstance(event, Started | Accepted):
             self._worker.queue.update(job, durable=job.views == 1)
+        # Obey: these are the places where a job may end or wait without losing a view.
         self._worker.check(job)
         if isinstance(event, Accepted | Decided):
             self._pause()

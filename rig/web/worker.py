@@ -33,7 +33,7 @@ from rig.web.picture import LivePicture, jpeg
 from rig.web.requests import Job, JobState
 from rig.web.setup import Setup
 
-IDLE_S: Final = 0.05
+IDLE_S: Final = 0.05  # shorter: an idle bench heats the computer; longer: a job and a STOP at rest wait for it
 """Time between two checks of the queue."""
 STATUS_S: Final = 0.25  # a page that shows the angle looks smooth enough; more messages load the bus and the network
 """Time between two messages about the state of the table."""
@@ -58,12 +58,7 @@ class BenchWorker:
     ``run_job`` is `rig.web.work.run_job`.
     """
 
-    def __init__(
-        self,
-        setup: Setup,
-        clock: SystemClock,
-        run_job: Callable[["BenchWorker", Job], None],
-    ) -> None:
+    def __init__(self, setup: Setup, clock: SystemClock, run_job: Callable[["BenchWorker", Job], None]) -> None:
         def changed(job: Job) -> None:
             self.publish("job", job)
 
@@ -202,14 +197,17 @@ class BenchWorker:
         self.close()
 
     def _run(self, job: Job) -> None:
+        """Run a job to its end, and tell its state to all who look."""
+        # Show that it begins, and make room for its pictures.
         self._job = job
         # A job may ask before it reads the servo: until then, only this changes.
         self.status = self.status.model_copy(update={"job": job.id})
         self.publish("status", self.status)
-        self._stops_before = self.queue.heeded
+        self._stops_before = self.queue.heeded  # not the present number: a stop since then is for this job
         self.views[job.id] = []
         for old in list(self.views)[:-JOBS_WITH_PICTURES]:
             del self.views[old]
+        # The work itself. Whatever is not a `RigError` is a defect or a signal, and ends the program.
         state, error = JobState.FAILED, None
         try:
             if self._bench is not None:
@@ -228,6 +226,7 @@ class BenchWorker:
             raise
         finally:
             self._job = None
+        # The torque first: who pressed STOP waits for the answer, and the list of jobs may be on a slow disk.
         self._answer_stop()
         if isinstance(error, _LOST):
             self._error = error
@@ -311,7 +310,7 @@ class BenchWorker:
 
     def close(self, error: BaseException | None = None) -> None:
         """Close the bench; ``error`` is why."""
-        bench, self._bench = self._bench, None
+        bench, self._bench = self._bench, None  # first, so that no other function uses a bench that closes
         if bench is not None:
             with suppress(RigError):  # the fault is latched, and the next opening reports it
                 bench.__exit__(type(error), error, None)
@@ -345,7 +344,7 @@ class BenchWorker:
             bench.camera.capture(bench.clock.now_ns())
         except RigError as error:
             self._error = error
-            if self._job is None:
+            if self._job is None:  # a job that waits for the operator meets the error itself when it continues
                 self.close()
             self._read_status()
 
@@ -369,6 +368,7 @@ class BenchWorker:
 
     def _publish_status(self, state: ServoState | None) -> None:
         bench = self._bench
+        # An open bench works; all that may be wrong then is that its list of jobs cannot be stored.
         error = self._error if bench is None else self.queue.problem
         self._status_ns = self._clock.now_ns()
         values: dict[str, Any] = {"open": bench is not None, "job": self._job.id if self._job else None}
@@ -377,6 +377,7 @@ class BenchWorker:
         if bench is not None:
             values |= bench_facts(bench, state)
             values |= {"camera": bench.camera.identity, "locks": self._locks, "region": bench.config.view.roi}
+        # Without a reading, the values of the servo are unknown: none is shown, not the last one.
         if bench is not None and state is not None:
             values |= {
                 "velocity_dps": state.velocity_dps,

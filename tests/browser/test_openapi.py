@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 
 from rig.config import load_config
 from rig.web.app import create_app
-from rig.web.setup import Listening, Setup
+from rig.web.setup import Setup
 from tests.browser.conftest import WAIT_S
 from tests.rig.web.conftest import connected
 
@@ -23,7 +23,7 @@ def schema(tmp_path_factory: pytest.TempPathFactory):
     """The API's description; no bench runs behind it, so jobs stay in the queue."""
     folder: Path = tmp_path_factory.mktemp("api")
     config = load_config(None, [f"catalog.path={folder}/catalog", f"state_dir={folder}/state"])
-    _, server, disconnect = connected(Setup(bench="sim", config=config, listening=Listening(host="127.0.0.1", port=0)))
+    _, server, disconnect = connected(Setup(bench="sim", config=config))
     yield schemathesis.openapi.from_asgi("/api/v1/openapi.json", create_app(server))
     disconnect()
 

@@ -66,7 +66,7 @@ def serve(
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
     from rig.web.run import run_server
-    from rig.web.setup import Listening, Setup
+    from rig.web.setup import Setup
 
     # Tokens: these options change the stored ones, and start no server.
     folder = settings.load().state_path(settings.bench_name) / SERVER_FOLDER
@@ -92,14 +92,6 @@ def serve(
             f"Everybody at {host} needs a token, and there is none.",
             next_step=Do.NEW_TOKEN(role="operate"),
         )
-    listening = Listening(
-        host=host,
-        port=port,
-        other_hosts=tuple(allow_host or ()),
-        certfile=certfile,
-        keyfile=keyfile,
-        needs_login=needs_login,
-    )
     name = settings.bench_name
     if name in ("sim", "photographs") and "speed" not in settings.load().bench.get(name, {}):
         settings = settings.merged(overrides=[f"bench.{name}.speed=1"])  # people watch it
@@ -124,7 +116,12 @@ def serve(
         config_file=(settings.config or default_path() or Path(FILE_NAME)).absolute(),
         seed=settings.seed,
         arguments=arguments,
-        listening=listening,
+        host=host,
+        port=port,
+        other_hosts=tuple(allow_host or ()),
+        certfile=certfile,
+        keyfile=keyfile,
+        needs_login=needs_login,
     )
     run_server(setup, announce)
 

@@ -44,19 +44,10 @@ let states = {};
 export function readCsv(source) {
   const head = source.split("\n", 1)[0];
   const separator = head.split(";").length > head.split(",").length ? ";" : ",";
-  const rows = [[""]];
-  let quoted = false;
-  for (let k = 0; k < source.length; k += 1) {
-    const c = source[k];
-    const row = rows[rows.length - 1];
-    if (quoted) {
-      if (c !== '"') row[row.length - 1] += c;
-      else if (source[k + 1] === '"') row[row.length - 1] += source[(k += 1)];
-      else quoted = false;
-    } else if (c === '"') quoted = true;
-    else if (c === separator) row.push("");
-    else if (c === "\n") rows.push([""]);
-    else if (c !== "\r") row[row.length - 1] += c;
+  const rows = [[]];
+  for (const [, quoted, plain, end] of source.matchAll(new RegExp(`(?:"((?:[^"]|"")*)"|([^${separator}\r\n]*))(${separator}|\r?\n|$)`, "g"))) {
+    rows.at(-1).push(quoted?.replaceAll('""', '"') ?? plain);
+    if (end !== separator) rows.push([]);
   }
   return rows.filter((row) => row.some((cell) => cell.trim()));
 }

@@ -89,7 +89,7 @@ const load = pager(() => "/results?limit=500", ({ items }, isFirst) => {
   render();
 });
 on("hello", () => act(async () => {
-  runs = (await get("/runs?limit=500")).items.map((run) => run.name);
+  runs = (await get("/runs?limit=500")).items;
   await load();
   const one = rows.find((row) => row.id === wanted);
   if (one && !opened) {

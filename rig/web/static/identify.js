@@ -3,7 +3,6 @@ import { pathDrawing, picture, posePicture, viewPicture } from "./pictures.js";
 import "./shelf.js";
 
 const SHOWN = 4; // candidates: more are unlikely, and push the steps out of sight
-const CHARTED = 5; // candidates of the chart
 const KEPT = 10;
 const EMPTY_TABLE = 606;
 
@@ -22,14 +21,12 @@ chooseMode(); // a browser that reloads the page can keep the choice
 
 // -- the search, as its events tell it ------------------------------------------------------------------------------------
 
-const COLOURS = 8;
-const colours = new Map(); // of the candidates of a job: an object has the same one in the list and in the chart
 let search = null; // of the object on the table: views, steps, candidates
 let shown = null; // the answer that is large
 let ready = false; // whether events are new, not those of a page that was opened later
 
 function newSearch() {
-  search = { views: [], steps: [], notes: [], candidates: [], notEnrolled: null, azimuths: [], rows: [], live: "" };
+  search = { views: [], steps: [], notes: [], candidates: [], notEnrolled: null, live: "" };
 }
 newSearch();
 
@@ -66,12 +63,8 @@ function take(event, job) {
     case "started": newSearch(); shown = job.request.watch ? shown : null; break;
     case "waiting": search.live = event.reason === "first-object" ? "Put an object on the table." : "Put the next object on the table."; break;
     case "frame_used": s.live = `Looks like ${event.name} …`; break;
-    case "accepted": s.views.push({ number: event.picture, words: `${event.azimuth_deg.toFixed(0)}°` }); s.azimuths.push(event.azimuth_deg); break;
-    case "ranked":
-      s.candidates = event.candidates;
-      s.notEnrolled = event.decision?.not_enrolled ?? null;
-      for (const { name } of event.candidates.slice(0, CHARTED)) if (!colours.has(name)) colours.set(name, `c${colours.size % COLOURS}`);
-      break;
+    case "accepted": s.views.push({ number: event.picture, azimuth: event.azimuth_deg }); break;
+    case "ranked": [s.candidates, s.notEnrolled] = [event.candidates, event.decision?.not_enrolled ?? null]; break;
     case "identified": keep({ ...event, picture: s.views.at(-1)?.number, search: s }, job); break;
     case "failed": keep({ event: "failed", outcome: "failed", error: event, search: s }, job); break;
     case "recorded": if (ready) act(showLast); break;
@@ -156,12 +149,12 @@ function showSearch() {
   const best = Math.max(...candidates.map((one) => one.probability ?? one.score), s.notEnrolled ?? 0, 1e-9);
   const rows = candidates.map((one) => h("li", { title: one.probability === null ? `score ${one.score.toFixed(3)}` : percent(one.probability) },
     h("img", { src: posePicture(one.name, Math.round(one.pose_deg / 15) * 15), alt: "" }),
-    h("div", { class: colours.get(one.name) }, h("span", {}, one.name), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
-  if (s.notEnrolled !== null) rows[s.notEnrolled === best ? "unshift" : "push"](h("li", { title: percent(s.notEnrolled) }, h("span", { class: "none", "aria-hidden": "true" }, "?"), h("div", { class: "soft" }, h("span", {}, "none of the enrolled objects"), h("div", { class: "bar" }, h("i", { style: `width: ${(100 * s.notEnrolled) / best}%` })))));
+    h("div", {}, one.name, h("div", { class: "bar c0" }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
+  if (s.notEnrolled !== null) rows[s.notEnrolled === best ? "unshift" : "push"](h("li", { title: percent(s.notEnrolled) }, h("span", { class: "none", "aria-hidden": "true" }, "?"), h("div", { class: "soft" }, "none of the enrolled objects", h("div", { class: "bar" }, h("i", { style: `width: ${(100 * s.notEnrolled) / best}%` })))));
   $("candidates").replaceChildren(...rows);
-  $("way").replaceChildren(pathDrawing(s.azimuths.slice(-9)));
+  $("way").replaceChildren(pathDrawing(s.views.slice(-9).map((view) => view.azimuth)));
   $("steps").replaceChildren(...s.steps.slice(-12).map((step) => h("li", { class: step.soft ? "soft" : "" }, step.words)));
-  update($("thumbs"), ...s.views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), view.words)));
+  update($("thumbs"), ...s.views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), `${view.azimuth.toFixed(0)}°`)));
   $("notes").replaceChildren(...s.notes.map((words) => h("li", {}, words)));
   $("search").hidden = !s.views.length;
 }
@@ -199,7 +192,6 @@ followJob(["identify"], {
     job = next;
     ready = false;
     [shown, twinOf] = [null, ""];
-    colours.clear();
     newSearch();
   },
   event: take,

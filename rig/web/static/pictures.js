@@ -1,7 +1,7 @@
 // Pictures: the live image, an object that turns, pairs of pictures, the path of a search.
 import { API, at, duration, get, h, on } from "./rig.js";
 
-export const viewPicture = (id) => `${API}/views/${id}/picture`;
+export const viewPicture = (id) => `${API}/views/${id}/image`;
 export const posePicture = (name, azimuthDeg = 0) => `${API}/pose-picture?object=${at(name)}&azimuth_deg=${azimuthDeg.toFixed(1)}`;
 
 /** Return a picture with words below it. */
@@ -28,16 +28,11 @@ class RigLive extends HTMLElement {
 
   connectedCallback() {
     this.image = h("img", { id: "live-image", class: "whole", alt: "Live image of the table" });
-    this.outline = h("svg", { id: "outline", "aria-hidden": "true" });
     this.age = h("p", { id: "live-age", role: "status", hidden: true });
-    this.frame = h("div", { class: "picture", id: "live" }, this.image, this.outline, this.age);
+    this.frame = h("div", { class: "picture", id: "live" }, this.image, this.age);
     this.append(this.frame);
     this.image.addEventListener("load", () => this.fit());
     on("status", (status) => { if (status.open) { this.region = status.region; this.fit(); } });
-    on("plan", (event) => {
-      if (event.event === "accepted" && event.outline_px) this.draw(event.outline_px);
-      if (event.event === "moved" || event.event === "waiting" || event.event === "started") this.outline.replaceChildren();
-    });
     this.fetchAll();
     setInterval(() => this.mark(), 500);
   }
@@ -52,13 +47,6 @@ class RigLive extends HTMLElement {
     [style.width, style.height] = [`${(100 * width) / w}%`, `${(100 * height) / tall}%`];
     [style.left, style.top] = [`${(-100 * x) / w}%`, `${(-100 * y) / tall}%`];
     style.maxWidth = "none";
-    this.outline.setAttribute("viewBox", `${x} ${y} ${w} ${tall}`);
-  }
-
-  /** Draw the outline of the object. */
-  draw(found) {
-    const path = found.points.map(([x, y], k) => `${k ? "L" : "M"}${x} ${y}`).join(" ");
-    this.outline.replaceChildren(h("path", { d: `${path} Z`, fill: "none", stroke: "#ffd34d", "stroke-width": 2, "vector-effect": "non-scaling-stroke" }));
   }
 
   async fetchOne() {

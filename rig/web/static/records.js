@@ -1,5 +1,5 @@
 // Calibrations, log, settings and tokens: each part runs on the page that has its element.
-import { $, act, ask, at, canOperate, counted, dayOf, definitions, followJob, get, h, number, on, pager, personOf, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
+import { $, act, ask, at, canOperate, counted, dayOf, definitions, details, followJob, get, h, on, pager, personOf, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
 
 // -- calibrations -----------------------------------------------------------------------------------------------------------
 
@@ -57,27 +57,6 @@ if ($("calibrations")) {
 
 // -- the log ------------------------------------------------------------------------------------------------------------------
 
-const OUTCOMES = { found: (name) => `identified ${name}`, unknown: () => "identified an unknown object", ambiguous: (name) => `could not tell ${name} from another object`, empty: () => "found the table empty" };
-const SENTENCES = {
-  "enrollment started": ({ object_name: name, details }) => `began to enroll ${name}${details.replace ? " again" : ""}, ${counted(details.views, "view")}`,
-  "enrollment resumed": ({ object_name: name }) => `continued the enrollment of ${name}`,
-  "enrollment abandoned": ({ object_name: name }) => `ended an enrollment of ${name}`,
-  "enrollment discarded": ({ object_name: name }) => `discarded an enrollment of ${name}`,
-  "enrollment superseded": ({ object_name: name }) => `replaced the earlier enrollment of ${name}`,
-  enrolled: ({ object_name: name, details }) => details.taken_again ? `took ${counted(details.taken_again.length, "view")} of ${name} again` : `enrolled ${name} with ${counted(details.views, "view")}`,
-  identified: ({ object_name: name, details }) => (OUTCOMES[details.outcome] || (() => "identified an object"))(name) + (details.sample ? `, sample ${details.sample}` : ""),
-  "result corrected": ({ object_name: name, details }) => `corrected answer ${details.result}${name ? ` to ${name}` : ""}${details.reason ? `: ${details.reason}` : ""}`,
-  renamed: ({ object_name: name, details }) => `renamed ${details.old_name || details.before || "an object"} to ${name}`,
-  labelled: ({ object_name: name }) => `changed the label or note of ${name}`,
-  deleted: ({ object_name: name }) => `deleted ${name}`,
-  undeleted: ({ object_name: name }) => `restored ${name}`,
-  imported: ({ object_name: name }) => `imported ${name || "objects"}`,
-  "collected garbage": () => "removed deleted objects from the disk",
-  delivered: () => "delivered objects to the shared catalog",
-  moved: ({ details }) => `rotated the table to ${number(details.to_deg, 1)}°${details.ended ? `, which ended early: ${details.ended}` : ""}`,
-  "photographed the empty table": () => "took the empty-table image",
-};
-
 if ($("log")) {
   let lastDay = "";
   const log = pager(() => "/log?limit=100", ({ items }, isFirst) => {
@@ -86,8 +65,8 @@ if ($("log")) {
       const day = dayOf(entry.time_utc);
       if (day !== lastDay) $("log").append(h("li", { style: "display: block" }, h("h2", {}, day)));
       lastDay = day;
-      const who = personOf(entry.details.operator || "") || entry.user;
-      $("log").append(h("li", {}, h("time", { datetime: entry.time_utc }, timeOf(entry.time_utc)), h("div", {}, h("strong", {}, who), ` ${(SENTENCES[entry.action] || (() => `${entry.action} ${entry.object_name || ""}`))(entry)}.`)));
+      const { operator = "", ...others } = entry.details;
+      $("log").append(h("li", {}, h("time", { datetime: entry.time_utc }, timeOf(entry.time_utc)), h("div", {}, h("strong", {}, personOf(operator) || entry.user), ` ${entry.action} ${entry.object_name || ""} `, h("span", { class: "soft" }, details(others)))));
     }
     if (!$("log").children.length) $("log").append(h("li", { class: "empty" }, "Nothing has happened yet."));
   });

@@ -411,53 +411,47 @@ export function jobTitle(job) {
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
 }
 
-// While a list of jobs is on its way, events may tell newer states than its answer has, and new jobs.
-const loads = new Set();
-on("job", (job) => loads.forEach((jobs) => jobs.set(job.id, job)));
-
-async function loadJobs(query = "limit=50") {
-  const newer = new Map();
-  loads.add(newer);
-  try {
-    const { items } = await get(`/jobs?${query}`);
-    const listed = items.map(({ id }) => id);
-    const others = [...newer.values()].filter(({ id }) => !listed.includes(id)).reverse();
-    return [...others, ...items.map((job) => newer.get(job.id) || job)];
-  } finally {
-    loads.delete(newer);
-  }
-}
+// The jobs that the page knows. While a list of them is on its way, events tell newer states than its answer has.
+const jobs = new Map();
+const newer = new Set();
+let loads = 0;
+on("job", (job) => {
+  newer.add(job.id);
+  jobs.set(job.id, job);
+  dispatch("jobs", job);
+});
+on("hello", () => act(async () => {
+  const mine = (loads += 1);
+  newer.clear();
+  const lists = await Promise.all([get("/jobs?limit=50"), get("/jobs?state=proposed")]);
+  if (mine !== loads) return; // the connection was lost again, and another list is on its way
+  for (const id of jobs.keys()) if (!newer.has(id)) jobs.delete(id);
+  for (const job of lists.flatMap(({ items }) => items)) if (!newer.has(job.id)) jobs.set(job.id, job);
+  dispatch("jobs", null);
+}));
+const newestFirst = () => [...jobs.values()].sort((a, b) => (a.created_utc < b.created_utc ? 1 : -1));
+export const newestOf = (some) => some.find((job) => ACTIVE.includes(job.state)) || some[0];
 
 // -- proposed jobs: every page shows them, and an operator approves or rejects them ---------------------------------------
 
-const proposed = new Map();
-
-/** Return all that the request of a job says besides its title. */
-function jobDetails({ request: { kind, name: _name, angle_deg: _angle, ...others } }) {
-  if (kind === "retake") return "";
-  const words = (value) => (Array.isArray(value) ? value.map((one) => one.name ?? one).join(", ") : value);
-  return Object.entries(others).filter(([, value]) => value !== null && value !== false).map(([key, value]) => `${key.replaceAll("_", " ")}${value === true ? "" : `: ${words(value)}`}`).join("; ");
+/** Return values with their names in words, such as "views: 24; replace". */
+export function details(values) {
+  const words = (key, value) => (Array.isArray(value) ? value.map((one) => one.name ?? one).join(", ") : key.endsWith("_deg") ? `${number(value, 1)}°` : value);
+  const given = Object.entries(values).filter(([, value]) => value !== false && String(value ?? "") !== "");
+  return given.map(([key, value]) => `${key.replace(/_(deg|id)$/, "").replaceAll("_", " ")}${value === true ? "" : `: ${words(key, value)}`}`).join("; ");
 }
 
 function showProposals() {
-  $("proposals").replaceChildren(...[...proposed.values()].map((job) => {
-    const details = jobDetails(job);
+  $("proposals").replaceChildren(...newestFirst().filter((job) => job.state === "proposed").reverse().map((job) => {
+    const { kind, name: _name, angle_deg: _angle, ...others } = job.request;
+    const more = kind === "retake" ? "" : details(others);
     const post = (what) => () => act(() => request("POST", `/jobs/${job.id}/${what}`));
     const buttons = [h("button", { onclick: post("approve") }, "Approve"), " ", h("button", { class: "quiet", onclick: post("cancel") }, "Reject")];
-    return h("p", {}, h("strong", {}, job.operator), ` proposes: ${jobTitle(job)}${details && ` (${details})`}. `, ...(canOperate() ? buttons : ["It waits for an operator."]));
+    return h("p", {}, h("strong", {}, job.operator), ` proposes: ${jobTitle(job)}${more && ` (${more})`}. `, ...(canOperate() ? buttons : ["It waits for an operator."]));
   }));
 }
 
-on("job", (job) => {
-  if (job.state === "proposed") proposed.set(job.id, job);
-  if (job.state === "proposed" || proposed.delete(job.id)) showProposals();
-});
-on("hello", () => act(async () => {
-  const jobs = await loadJobs("state=proposed");
-  proposed.clear();
-  for (const job of jobs.reverse()) if (job.state === "proposed") proposed.set(job.id, job);
-  showProposals();
-}));
+on("jobs", showProposals);
 on("me", showProposals);
 
 /** Show a job in a box: progress, question, buttons and, unless the page shows it elsewhere, the outcome. */
@@ -493,8 +487,6 @@ export function showJob(box, job, withOutcome = true) {
   if (question !== asked) question?.querySelector("input")?.focus();
   return undefined;
 }
-
-export const newestOf = (jobs) => jobs.find((job) => ACTIVE.includes(job.state)) || jobs[0];
 
 /** Return the events of a job so far, and the id of the last one; of an old identification those of its saved run. */
 async function eventsOf(job) {
@@ -535,12 +527,12 @@ export function followJob(kinds, { begin = () => {}, event = () => {}, render })
       render(job, !waiting);
     } else if (!shown || (job.created_utc >= shown.created_utc && (job.state !== "queued" || isEnded(shown)))) open(job);
   }
-  on("job", take);
-  on("hello", () => act(async () => {
+  on("jobs", (job) => {
+    if (job) return take(job);
     shown = null;
-    const newest = newestOf((await loadJobs()).filter(counts));
-    if (newest) await open(newest);
-  }));
+    const newest = newestOf(newestFirst().filter(counts));
+    return newest && open(newest);
+  });
   on("plan", (one, id) => {
     if (one.job !== shown?.id) return;
     if (waiting) waiting.push([one, id]);
@@ -553,10 +545,9 @@ export function followJob(kinds, { begin = () => {}, event = () => {}, render })
 
 /** Show all jobs: the one that was chosen, or else the newest, and a list. Call `changed` with the shown one. */
 export function listJobs(changed) {
-  const jobs = new Map();
   let open = null;
   const showAll = () => {
-    const newest = [...jobs.values()].sort((a, b) => (a.created_utc < b.created_utc ? 1 : -1));
+    const newest = newestFirst();
     const chosen = jobs.get(open) || newestOf(newest);
     showJob($("job"), chosen);
     if (chosen) changed(chosen);
@@ -564,15 +555,10 @@ export function listJobs(changed) {
       ...newest.slice(0, 8).map((job) => h("li", { "data-of": job.id }, h("button", { class: "link", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${[STATES[job.state] || job.state, when(job.created_utc), personOf(job.operator)].filter(Boolean).join(", ")}`)),
     );
   };
-  on("job", (job) => {
-    if (!jobs.has(job.id)) open = null;
-    jobs.set(job.id, job);
+  on("jobs", (job) => {
+    if (job?.state === "queued") open = null; // a new one is shown
     showAll();
   });
-  on("hello", () => act(async () => {
-    for (const job of await loadJobs()) jobs.set(job.id, job);
-    showAll();
-  }));
 }
 
 /** Return a function that loads a list from its beginning. `add` gets its pages; the button #more loads the next one. */

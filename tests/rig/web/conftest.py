@@ -22,7 +22,7 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.web.front import guarded, uvicorn_config
 from rig.web.server import Server
-from rig.web.setup import Listening, Setup
+from rig.web.setup import Setup
 from rig.web.work import run_job
 from rig.web.worker import BenchWorker
 from tests.small import SMALL
@@ -47,6 +47,18 @@ class Served:
             threading.Event().wait(0.01)
         pytest.fail(f"the bench is not open: {self.worker.status}")
 
+    def post_at(self, action: str, wanted: Callable[[dict[str, Any]], bool]) -> None:
+        """Pause or cancel a job at the first event that is wanted."""
+        publish = self.worker.publish
+
+        def published(kind: str, data: Any, job: Any = None) -> None:
+            publish(kind, data, job)
+            if kind == "plan" and wanted(data):
+                self.worker.publish = publish
+                assert self.client.post(f"/api/v1/jobs/{data['job']}/{action}").status_code == 200
+
+        self.worker.publish = published
+
     def run(self, **request: Any) -> dict[str, Any]:
         """Submit a job, and return it when it has ended."""
         answer = self.client.post("/api/v1/jobs", json=request)
@@ -70,11 +82,11 @@ def connected(setup: Setup) -> tuple[BenchWorker, Server, Callable[[], None]]:
     worker = BenchWorker(setup, SystemClock(), run_job)
     ours, theirs = socket.socketpair()
     server = Server(setup, SystemClock(), theirs)
-    server.remote.start()
+    server.bench.start()
     bench_link = worker.connect(ours)
 
     def disconnect() -> None:
-        server.remote.close()
+        server.bench.close()
         bench_link.close()
         worker.close_stops()
 
@@ -89,8 +101,14 @@ def starting(folder: Path) -> Iterator[Callable[..., Served]]:
     def start(*settings: str, needs_login: bool = False) -> Served:
         folders = [f"catalog.path='{folder}/catalog'", f"state_dir='{folder}/state'"]
         config = load_config(None, [*folders, f"calibration_dir='{folder}/cal'", *SMALL, *settings])
-        listening = Listening(host="127.0.0.1", port=0, needs_login=needs_login, max_upload_bytes=2_000_000)
-        setup = Setup(bench="sim", config=config, seed=1, arguments=("--bench", "sim"), listening=listening)
+        setup = Setup(
+            bench="sim",
+            config=config,
+            seed=1,
+            arguments=("--bench", "sim"),
+            needs_login=needs_login,
+            max_upload_bytes=2_000_000,
+        )
         worker, server, disconnect = connected(setup)
         client = TestClient(guarded(server), base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
         thread = threading.Thread(target=worker.run, daemon=True)
@@ -113,7 +131,7 @@ def starting(folder: Path) -> Iterator[Callable[..., Served]]:
 @contextmanager
 def over_http(served: Served) -> Iterator[str]:
     """Yield the host and port at which a server answers over HTTP."""
-    web = uvicorn.Server(uvicorn_config(guarded(served.server), served.server.setup.listening))
+    web = uvicorn.Server(uvicorn_config(served.server))
     with socket.create_server(("127.0.0.1", 0)) as listening:
         thread = threading.Thread(target=web.run, args=([listening],))
         thread.start()

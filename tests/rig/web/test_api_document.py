@@ -21,7 +21,7 @@ from rig.web.api_bench import Status
 from rig.web.api_catalog import ListedResult, LogRow
 from rig.web.app import create_app
 from rig.web.server import Server
-from rig.web.setup import Listening, Setup
+from rig.web.setup import Setup
 
 KINDS = {next(f.default for f in fields(kind) if f.name == "event") for kind in get_args(Event)}
 
@@ -31,7 +31,7 @@ PROBLEM = {"application/problem+json": {"schema": {"$ref": "#/components/schemas
 
 
 def made() -> dict[str, Any]:
-    setup = Setup(bench="sim", config=RigConfig(), listening=Listening(host="127.0.0.1", port=0))
+    setup = Setup(bench="sim", config=RigConfig())
     with socket.socket() as unused:
         return create_app(Server(setup, SystemClock(), unused)).openapi()
 
@@ -48,7 +48,7 @@ def test_committed_document_is_that_of_the_program(served, document):
 
 def test_each_operation_has_a_plain_name_a_schema_for_its_answer_and_the_right_that_it_needs(document):
     operations = [one for methods in document["paths"].values() for one in methods.values()]
-    assert len({one["operationId"] for one in operations}) == len(operations) == 52
+    assert len({one["operationId"] for one in operations}) == len(operations) == 51
     for one in operations:
         (answer,) = (found for status, found in one["responses"].items() if status.startswith("2"))
         assert all(content["schema"] for content in answer["content"].values()), one["operationId"]
@@ -125,7 +125,7 @@ def test_stream_saved_run_and_lists_have_the_fields_of_the_document(serve):
     saved = served.client.get(f"/api/v1/runs/{job['run']}").json()["events"]
     assert {"started", "moved", "accepted", "ranked", "identified", "enrolled"} <= {data["event"] for data in sent}
     for data in (*sent, *saved):
-        assert data.keys() - event_dict(event_of(data)).keys() <= {"job", "text", "steps", "picture", "outline_px"}
+        assert data.keys() - event_dict(event_of(data)).keys() <= {"job", "text", "steps", "picture"}
         assert event_dict(event_of(data)).items() <= data.items()
 
     get = served.client.get

@@ -6,8 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.web.hub import Hub
+from tests.fuzzing import examples
 
 
+@examples(20)
 @given(st.integers(1, 30), st.lists(st.integers(0, 12), max_size=12))
 def test_listener_gets_each_message_once_or_learns_that_some_are_lost(capacity, bursts):
     hub = Hub("e", capacity)
@@ -25,6 +27,7 @@ def test_listener_gets_each_message_once_or_learns_that_some_are_lost(capacity, 
         number = messages[-1].number if messages else number
 
 
+@examples(20)
 @given(st.text(max_size=20))
 def test_any_last_event_id_gives_a_position(text):
     hub = Hub("epoch")

@@ -3,62 +3,31 @@
 import asyncio
 import json
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from inspect import signature
 from typing import Any, get_args
+from urllib.request import Request, urlopen
 
 import pytest
 
-from rig.bench import Bench, open_bench
+from rig.bench import Bench
 from rig.calibrations import CalibrationStore
 from rig.catalog import Catalog
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound, StateNotStored
-from rig.devices.servo import ServoState
 from rig.doctor.examination import run_checks
 from rig.motion.arrival import QUIET_COUNTS
 from rig.safety.saved_state import SERVER_FOLDER, SESSION
-from rig.safety.stop_channel import StopAnswer, StopRequest
+from rig.web.access import Role
 from rig.web.requests import GotoRequest, JobRequest
-from rig.web.setup import Listening, Setup
+from rig.web.setup import Setup
 from rig.web.work import JOBS
 from tests.rig.calibrations.test_calibrations import RESULT
-from tests.rig.web.conftest import Served, connected
+from tests.rig.web.conftest import connected, over_http
 
 AT_REST_DEG = QUIET_COUNTS * 360 / 4096
 """Angle by which two readings of a table at rest may differ."""
-
-
-@dataclass
-class Halted:
-    """A motion that waits at 20° until it shall stop, and then until nothing holds the lock."""
-
-    reached: threading.Event = field(default_factory=threading.Event)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-
-@pytest.fixture
-def halted(monkeypatch) -> Halted:
-    halt = Halted()
-
-    def opened(*arguments: Any, **options: Any) -> Bench:
-        bench = open_bench(*arguments, **options)
-
-        def observe(state: ServoState) -> None:
-            if halt.reached.is_set() or bench.safety.angle_reference.to_table(state.position_deg) < 20.0:
-                return
-            halt.reached.set()
-            while not bench.state.stop_requested():
-                SystemClock().sleep(0.001)
-            with halt.lock:
-                pass
-
-        bench.safety.observers.append(observe)
-        return bench
-
-    monkeypatch.setattr("rig.web.worker.open_bench", opened)
-    return halt
 
 
 def test_status_says_that_the_list_of_jobs_was_damaged(serve, tmp_path):
@@ -156,41 +125,10 @@ def test_each_object_has_the_sample_that_the_answer_to_its_question_names(serve)
     assert [one["sample"] for one in results] == ["S-3", None, "S-1"]
 
 
-def test_listeners_learn_when_a_job_ends_after_the_answer_to_a_stop(serve, halted):
-    served = serve()
-    job = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
-    assert halted.reached.wait(60.0)
-    with halted.lock:
-        request = StopRequest(served.server.setup.config.state_path("sim"))
-        assert request.answer() is None
-    assert served.wait(job["id"])["state"] == "cancelled"
-    assert request.answer() is StopAnswer.TORQUE_OFF
-    request.close()
-    assert stops_of(served, 2) == [{"ended": False}, {"ended": True, "torque_off": True}]
-
-
-def stops_of(served: Served, number: int) -> list[dict[str, Any]]:
-    """Return the events about stops when there are as many."""
-    while True:
-        found = [json.loads(one.data) for one in served.server.hub.since(0)[0] if one.kind == "stop"]
-        if len(found) >= number:
-            return found
-        SystemClock().sleep(0.005)
-
-
 def test_job_that_meets_an_interrupted_enrollment_offers_to_continue_it(serve):
     served = serve("bench.sim.object='lamp'")
-    worker = served.worker
-    publish = worker.publish
-
-    def published(kind: str, data: Any, job: Any = None) -> None:
-        publish(kind, data, job)
-        if kind == "plan" and data.get("picture") == 1:
-            assert served.client.post(f"/api/v1/jobs/{data['job']}/cancel").status_code == 200
-
-    worker.publish = published
+    served.post_at("cancel", lambda event: event.get("picture") == 1)
     assert served.run(kind="enroll", name="lamp", views=4)["state"] == "cancelled"
-    worker.publish = publish
     job = served.run(kind="enroll", name="lamp", views=4)
     assert (job["state"], job["views"], job["error"]["code"]) == ("failed", 0, 700)
     assert job["resume"]["resume"]
@@ -275,6 +213,22 @@ def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(ser
         assert [one.views for one in catalog.objects()] == [6]
 
 
+def test_program_over_http_repeats_its_request_and_follows_the_stream_of_events(serve):
+    served = serve("bench.sim.object='lamp'", needs_login=True).opened()
+    who = {"Authorization": f"Bearer {served.server.sessions.tokens.new('cell', Role.OPERATE)}"}
+    request = {"kind": "enroll", "name": "lamp", "views": 4}
+    with over_http(served) as place, urlopen(Request(f"http://{place}/api/v1/events", headers=who), timeout=60) as sent:
+        for _ in range(2):
+            answer = served.client.post("/api/v1/jobs", json=request, headers={**who, "Idempotency-Key": "cell-7"})
+        data = (json.loads(line[len(b"data: ") :]) for line in sent if line.startswith(b"data: "))
+        seen = [{"event": "hello"}]
+        while seen[-1].get("state") != "done":
+            seen.append(next(data))
+    assert (sent.headers["content-type"], seen[-1]["id"]) == ("text/event-stream; charset=utf-8", answer.json()["id"])
+    assert [one.get("event") for one in seen].count("enrolled") == 1
+    assert len(served.worker.queue.jobs()) == 1
+
+
 async def first_event(stream):
     return await anext(stream)
 
@@ -348,7 +302,7 @@ def test_server_that_ends_in_a_job_stores_how_it_ended(tmp_path, monkeypatch, er
 
     monkeypatch.setattr("rig.web.work.page_line", fail)
     config = load_config(None, [f"catalog.path={tmp_path}/catalog", f"state_dir={tmp_path}/state"])
-    setup = Setup(bench="sim", config=config, listening=Listening(host="127.0.0.1", port=0))
+    setup = Setup(bench="sim", config=config)
     worker, _, disconnect = connected(setup)
     job = worker.queue.submit(GotoRequest(angle_deg=30), "anna")
     with pytest.raises(type(error)):

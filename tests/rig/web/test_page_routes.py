@@ -35,7 +35,7 @@ def test_picture_of_a_pose_is_the_nearest_view(enrolled):
         nearest = min(views, key=lambda view: abs((view["azimuth_deg"] - azimuth + 180) % 360 - 180))
         picture = get(served, f"pose-picture?object=mug-star&azimuth_deg={azimuth}")
         assert picture.headers["content-type"] == "image/jpeg"
-        assert picture.content == get(served, f"views/{nearest['id']}/picture").content
+        assert picture.content == get(served, f"views/{nearest['id']}/image").content
     get(served, "pose-picture?object=none", 404)
     get(served, "pose-picture?object=mug-star&azimuth_deg=nan", 422)
 
@@ -52,7 +52,7 @@ def test_twins_look_alike_from_behind_and_differ_at_the_star(enrolled):
 
     def difference(pair):
         images = [
-            cv2.imdecode(np.frombuffer(get(served, f"views/{pair[key]}/picture").content, np.uint8), 1).astype(float)
+            cv2.imdecode(np.frombuffer(get(served, f"views/{pair[key]}/image").content, np.uint8), 1).astype(float)
             for key in ("view", "other_view")
         ]
         return np.abs(images[0] - images[1]).mean()

@@ -7,16 +7,16 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 from rig.config import load_config
-from rig.web.setup import Listening, Setup
+from rig.web.setup import Setup
 
 
 @pytest.fixture
 def serve(tmp_path, monkeypatch):
     """Run `rig serve`; a server that would start is returned instead."""
-    started: list[Listening] = []
+    started: list[Setup] = []
 
     def run_server(setup, ready):
-        started.append(setup.listening)
+        started.append(setup)
         ready("http://127.0.0.1:1/")
 
     monkeypatch.setattr("rig.web.run.run_server", run_server)
@@ -29,19 +29,19 @@ def serve(tmp_path, monkeypatch):
 
 
 def test_server_says_that_every_user_of_the_computer_can_operate(serve):
-    done, listening = serve()
-    assert not listening.needs_login
+    done, setup = serve()
+    assert not setup.needs_login
     assert "Every user of this computer can operate the bench" in done.stderr
     assert "--login" in done.stderr
 
 
 def test_login_asks_for_a_token_on_this_computer_too(serve):
-    done, listening = serve("--login")
-    assert (done.exit_code, listening) == (2, None)
+    done, setup = serve("--login")
+    assert (done.exit_code, setup) == (2, None)
     assert "rig serve --new-token NAME" in done.stderr
     assert serve("--new-token", "anna", "--role", "operate")[0].exit_code == 0
-    done, listening = serve("--login")
-    assert listening.needs_login
+    done, setup = serve("--login")
+    assert setup.needs_login
     assert "Every user" not in done.stderr
 
 
@@ -67,5 +67,5 @@ def test_web_process_gets_the_same_configuration():
         None,
         ["catalog.url='postgresql://user:secret@host/rig'", "catalog.images='/images'", "table.limits_deg=[-200,370]"],
     )
-    setup = Setup(bench="sim", config=config, seed=3, listening=Listening(host="127.0.0.1", port=0), local_token="t")
+    setup = Setup(bench="sim", config=config, seed=3, local_token="t")
     assert Setup.model_validate_json(setup.model_dump_json()) == setup

@@ -1,6 +1,7 @@
 """STOP waits for nothing: not for the queue, its disk, exports or wrong tokens. And nothing starts after it."""
 
 import asyncio
+import json
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -30,7 +31,8 @@ class Motion:
         self.reached = threading.Event()
         self.released = threading.Event()
         self.bench: Bench | None = None
-        self.torque_when_stored: list[int] = []
+        self.lock = threading.Lock()
+        """While a test holds it, the motion does not go on after STOP."""
 
     def watch(self, bench: Bench) -> None:
         self.bench = bench
@@ -40,6 +42,8 @@ class Motion:
                 self.reached.set()
                 while not bench.state.stop_requested() and not self.released.is_set():
                     CLOCK.sleep(0.001)
+                with self.lock:
+                    pass
 
         bench.safety.observers.append(observe)
 
@@ -139,6 +143,21 @@ def test_stop_does_not_wait_for_the_queue_and_its_disk(moving):
     all_cancelled(moving)
 
 
+def test_listeners_learn_when_a_job_ends_after_the_answer_to_a_stop(serve, motion):
+    served = serve()
+    job = served.client.post("/api/v1/jobs", json=GOTO).json()
+    assert motion.reached.wait(60.0)
+    with motion.lock:
+        request = request_stop(served)
+        assert request.answer() is None
+    assert served.wait(job["id"])["state"] == "cancelled"
+    assert request.answer() is StopAnswer.TORQUE_OFF
+    request.close()
+    while len(sent := [json.loads(one.data) for one in served.server.hub.since(0)[0] if one.kind == "stop"]) < 2:
+        CLOCK.sleep(0.005)
+    assert sent == [{"ended": False}, {"ended": True, "torque_off": True}]
+
+
 def test_stop_does_not_wait_for_exports(moving, motion):
     """More exports run than there are threads for them."""
     free = threading.Event()
@@ -146,7 +165,7 @@ def test_stop_does_not_wait_for_exports(moving, motion):
     async def stop_beside_exports() -> dict[str, Any]:
         exports = [asyncio.ensure_future(long_work(lambda: free.wait(60.0))) for _ in range(45)]
         await asyncio.sleep(0)
-        done = await moving.server.remote.stop()
+        done = await moving.server.stop()
         free.set()
         await asyncio.gather(*exports)
         return done
@@ -224,16 +243,7 @@ def test_stop_during_a_pause_within_a_search_holds_the_cable_budget(serve):
     served = serve("bench.sim.object='mug-white'", *known)
     for name in ("mug-white", "mug-star"):
         assert served.run(kind="enroll", name=name, views=6)["state"] == "done"
-    worker = served.worker
-    publish, moved = worker.publish, []
-
-    def published(kind: str, data: Any, job: Any = None) -> None:
-        publish(kind, data, job)
-        if kind == "plan" and data["event"] in ("decided", "frame_used") and not moved:
-            moved.append(data["event"])
-            assert served.client.post(f"/api/v1/jobs/{data['job']}/pause").status_code == 200
-
-    worker.publish = published
+    served.post_at("pause", lambda event: event["event"] in ("decided", "frame_used"))
     job = served.client.post("/api/v1/jobs", json={"kind": "identify"}).json()
     assert served.wait(job["id"], "paused")["state"] == "paused"
     before_deg = table_deg(served)
