@@ -85,14 +85,11 @@ class ComputerFiles:
         *,
         mode: int = 0o660,
         compatible: str = "",
-        hertz: int = 0,
     ) -> None:
-        """Add an I2C bus; ``compatible`` is its kind in the device tree, ``hertz`` its frequency there."""
+        """Add an I2C bus; ``compatible`` is its kind in the device tree."""
         self.write(f"sys/class/i2c-dev/i2c-{number}/name", f"{name}\n")
         if compatible:
-            node = self.write(f"sys/class/i2c-dev/i2c-{number}/device/of_node/compatible", f"{compatible}\0").parent
-            if hertz:
-                (node / "clock-frequency").write_bytes(hertz.to_bytes(4, "big"))
+            self.write(f"sys/class/i2c-dev/i2c-{number}/device/of_node/compatible", f"{compatible}\0")
         self.write(f"dev/i2c-{number}").chmod(mode)
 
     def i2c_driver(self, driver: str, number: int = 1, address: int = 0x68) -> None:

@@ -31,7 +31,6 @@ _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi
 """I2C buses of memory, monitors and clock chips, which must not be scanned."""
 _CONVERTERS = re.compile(r"bcm2835-(isp|codec)|pispbe|hevc", re.IGNORECASE)
 """Video devices of a Raspberry Pi that convert images; some claim to capture."""
-_USUAL_I2C_HZ = 100_000  # Linux's default where the device tree states no rate
 _RAW_RECEIVERS = re.compile(r"unicam|rp1-cfe", re.IGNORECASE)
 """Receivers of ribbon cables: they deliver raw values of the sensor, which OpenCV cannot develop."""
 _SENSORS = re.compile(r"((?:imx|ov|gc|s5k|hm|arducam)[\w-]*) \d+-[0-9a-f]{4}")
@@ -180,20 +179,6 @@ class Computer:
         from rig.devices.i2c import kernel_driver
 
         return kernel_driver(self._at(self.i2c_name(bus)).resolve().name, address, self.root)
-
-    def cannot_stretch_khz(self, bus: int | str) -> float | None:
-        """Return the frequency of a bus whose controller does not wait for a stretched clock; None for others.
-
-        The controllers of the Raspberry Pi up to the 4 (BCM2835, BCM2711) have this defect; that of the 5 has not.
-        """
-        node = f"sys/class/i2c-dev/{Path(self.i2c_name(bus)).name}/device/of_node"
-        if not re.search(r"bcm2(835|711)-i2c", self._text(f"{node}/compatible")):
-            return None
-        try:
-            hertz = int.from_bytes((self.root / node / "clock-frequency").read_bytes(), "big")
-        except OSError:
-            hertz = 0
-        return (hertz or _USUAL_I2C_HZ) / 1000
 
     def cameras(self) -> list[DeviceFile]:
         """Return the device files that deliver images: no converters, no metadata, no second file of one camera.

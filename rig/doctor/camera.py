@@ -141,11 +141,11 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     levels = [each.mean_level for each in seen]
     evidence: dict[str, Any] = {"frame_age_ms": 1e3 * max(ages), "frames_per_s": rate, "mean_levels": levels}
     if max(levels) < context.config.view.min_mean:
-        fix: SomeSteps = ("Take the lens cap off and switch the light on, then", Do.DOCTOR())
+        fix: SomeSteps = "Take the lens cap off and switch the light on"
         yield bad("black", "black: mean level {mean_level:.1f} of 255", fix, mean_level=max(levels), **evidence)
         return
     if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
-        fix = ("Unplug the camera, plug it in again, then", Do.DOCTOR())
+        fix = "Unplug the camera, plug it in again"
         yield bad("camera_frozen", "frozen: {frames} frames are identical", fix, frames=len(frames), **evidence)
         return
     text = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second"
@@ -163,8 +163,7 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         text = "the light changes by {spread:.0%} within {seconds:.0f} s"
         fix = (
             "Lamps flicker with the mains: set camera.exposure_us to whole periods of the lamp, 10000 at 50 Hz or 8333 "
-            "at 60 Hz. Keep daylight and shadows away, then",
-            Do.DOCTOR(),
+            "at 60 Hz. Keep daylight and shadows away"
         )
         yield warning("flicker", text, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
     # Would an enrollment accept this view?

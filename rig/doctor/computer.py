@@ -76,7 +76,7 @@ def ports(context: DoctorContext) -> Iterator[Finding]:
         yield _device_file(context, "I2C bus", bus, computer.i2c_buses(bus), "i2c", i2c_command(context))
     camera = camera_node(config.camera.source)
     if camera is not None:  # else it is a file or a stream
-        connect = ("Connect the camera, then", Do.FIND())
+        connect = "Connect the camera"
         yield _device_file(context, "camera", camera, computer.cameras(), "video", connect)
 
 
@@ -93,7 +93,7 @@ def _no_serial_port(context: DoctorContext, wanted: str) -> Finding:
     if not adapters and (program := context.computer.running("brltty")) is not None:
         text = "there is no serial port {wanted}, and brltty (process {pid}) takes USB adapters for itself"
         return bad("brltty_takes_port", text, PORT_GRABBERS["brltty"], wanted=wanted, pid=program.pid)
-    return _missing("serial port", wanted, adapters, ("Plug the adapter in, then", Do.FIND()))
+    return _missing("serial port", wanted, adapters, "Plug the adapter in")
 
 
 def _missing(kind: str, wanted: str, found: Sequence[DeviceFile], connect: SomeSteps) -> Finding:

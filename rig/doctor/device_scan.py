@@ -13,7 +13,6 @@ from rig.config import CameraConfig
 from rig.config.imus import imu_kind, recognised
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
-from rig.core.next_steps import Do
 from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.picamera2_capture import import_picamera2
@@ -62,7 +61,7 @@ class DeviceScan:
             known.append(port)
         asked = [port for port in known if port.usb or computer.same_file(port.path, configured)]
         if not asked:
-            fix = ("Connect the U2D2, then", Do.FIND())
+            fix = "Connect the U2D2"
             yield bad("no_usb_port", "no serial port on USB (found: {found})", fix, found=[port.path for port in known])
         for port in asked:
             yield from self._on_port(context, port)
@@ -80,13 +79,13 @@ class DeviceScan:
         except DeviceNotFound as error:
             yield of_error(error)
         except (serial.SerialException, OSError) as error:
-            fix = ("Connect the adapter again, then", Do.FIND())
+            fix = "Connect the adapter again"
             yield bad("port_failed", "{port} failed: {reason}", fix, port=port.path, reason=str(error))
         else:
             yield from found
             if not found:
                 text = "{port} ({name}): no servo and no rig head answer at any baud rate"
-                fix = ("Check the servo's cable and switch on its supply, then", Do.FIND())
+                fix = "Check the servo's cable and switch on its supply"
                 yield warning("nothing_on_port", text, fix, port=port.path, name=port.name)
 
     def _servos(self, context: DoctorContext, port: SerialPort) -> list[Finding]:
@@ -156,7 +155,7 @@ class DeviceScan:
         if not nodes and not self._has_head:
             yield bad("no_i2c", "no I2C bus", i2c_command(context))
         elif len(self.candidates["IMU"]) == before and not self._has_head:
-            fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
+            fix = "Check the sensor's 3.3 V, ground, SDA and SCL"
             yield warning("no_imu_found", "no IMU answers on any I2C bus", fix)
 
     def find_cameras(self, context: DoctorContext) -> Iterator[Finding]:
@@ -166,7 +165,7 @@ class DeviceScan:
             self.candidates["camera"].append(_keys("camera", source=f"picamera2:{number}"))
             yield ribbon_camera(name, number)
         if not nodes and not ribbons:
-            yield warning("no_camera", "no camera", ("Connect the camera, then", Do.FIND()))
+            yield warning("no_camera", "no camera", "Connect the camera")
         for node in nodes:
             if (problem := access(context, node, "video")).steps:
                 yield problem

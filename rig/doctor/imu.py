@@ -26,8 +26,6 @@ SECONDS, DRAIN_S = 1.5, 0.25
 NOISY = 4.0  # multiple of the datasheet's noise that a quiet table does not exceed
 NO_REST_DPS = 20.0
 MAX_BIAS_DPS = 20.0  # zero-rate output of the MPU-6050's datasheet; more is a rotation, or a broken sensor
-STRETCH_KHZ = 20.0
-"""Highest frequency at which a controller that does not wait for a stretched clock reads a BNO055 correctly."""
 UPRIGHT = 0.94  # share of gravity along the table's axis when the sensor lies within 20° of it
 
 
@@ -130,13 +128,7 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
                 yield of_error(fault, Do.ACKNOWLEDGE())
             yield from _at_rest(context, head)
         return
-    # A Raspberry Pi's controller corrupts bytes of a sensor that stretches the clock: warn before the cause is in
-    # doubt.
-    bus, khz = computer.i2c_name(config.imu.bus), computer.cannot_stretch_khz(config.imu.bus)
-    if config.imu.model == "bno055" and khz is not None and khz > STRETCH_KHZ:
-        text = "{bus} runs at {khz:g} kHz and does not wait for a BNO055, which stretches the clock"
-        slower = "echo dtparam=i2c_arm_baudrate=10000 | sudo tee -a /boot/firmware/config.txt && sudo reboot"
-        yield warning("clock_stretching", text, slower, bus=bus, khz=khz)
+    bus = computer.i2c_name(config.imu.bus)
     try:
         there = scan_imus(computer, config.imu.bus)
     except OSError as error:
@@ -153,7 +145,7 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
         # The sensor works: now its samples and its bus.
         yield from _at_rest(context, sensor)
         if corrupt := getattr(getattr(sensor, "statistics", None), "corrupt", 0):
-            fix = SLOW_BUS if config.imu.model == "bno055" else ("Shorten the I2C cable, then", Do.DOCTOR())
+            fix = SLOW_BUS if config.imu.model == "bno055" else "Shorten the I2C cable"
             yield warning("corrupt_readings", "{corrupt} readings of the sensor were corrupt", fix, corrupt=corrupt)
 
 
@@ -164,7 +156,7 @@ def _wrong(context: DoctorContext, here: FoundImu | None, usable: list[FoundImu]
         other = {"found": here, "address": here.address, "model": config.model}
         text = "{found}, but imu.model is {model}"
         return unusable(context.computer, here) or bad("other_imu", text, Do.SETUP(), **other)
-    fix = Do.SETUP() if usable else ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
+    fix = Do.SETUP() if usable else "Check the sensor's 3.3 V, ground, SDA and SCL"
     text = "no device answers at {address:#04x} of {bus} (at other IMU addresses: {found})"
     bus = context.computer.i2c_name(config.bus)
     return bad("no_imu", text, fix, address=config.address, bus=bus, found=usable)
@@ -198,25 +190,25 @@ def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Finding:
     if len(samples.time_ns) < 0.8 * wanted:
         text = "{samples} samples in {seconds:g} s instead of {wanted:.0f}, {lost} lost"
         counts = {"samples": len(samples.time_ns), "seconds": SECONDS, "wanted": wanted, "lost": samples.lost}
-        fix = "Shorten the I2C cable and remove other devices from the bus, then"
-        return bad("samples_missing", text, (fix, Do.DOCTOR()), **counts)
+        fix = "Shorten the I2C cable and remove other devices from the bus"
+        return bad("samples_missing", text, fix, **counts)
     axis, rates = "xyz".index(context.config.imu.axis), samples.gyro_dps
     spread, bias = rates.std(axis=0), float(rates[:, axis].mean())
     expected = sensor.identity.gyro_noise_dps_rthz * np.sqrt(sensor.rate_hz / 2)
     evidence: dict[str, Any] = {"noise_dps": float(spread[axis]), "bias_dps": bias, "samples": len(rates)}
     noise, zero = "noise {noise_dps:.3f} °/s", "zero at {bias_dps:+.2f} °/s"
     if (np.abs(rates) >= sensor.range_dps * 0.999).any():
-        fix = "Check the sensor's supply and cable, then"
+        fix = "Check the sensor's supply and cable"
         text = "saturated at {range_dps:.0f} °/s at rest"
-        return bad("saturated", text, (fix, Do.DOCTOR()), range_dps=sensor.range_dps, **evidence)
+        return bad("saturated", text, fix, range_dps=sensor.range_dps, **evidence)
     if (rates == rates[0]).all():
-        fix = "Switch the sensor's supply off and on, then"
-        return bad("imu_frozen", "frozen: all samples are identical, without noise", (fix, Do.DOCTOR()), **evidence)
+        fix = "Switch the sensor's supply off and on"
+        return bad("imu_frozen", "frozen: all samples are identical, without noise", fix, **evidence)
     is_bad, is_noisy = spread.max() > NO_REST_DPS, spread.max() > NOISY * expected
     if is_bad or is_noisy:
-        fix = "Keep hands and vibration away from the bench, and check the sensor's supply, ground and cable, then"
+        fix = "Keep hands and vibration away from the bench, and check the sensor's supply, ground and cable"
         text, evidence = f"{noise} at rest; {{expected_dps:.3f}} °/s is usual", {"expected_dps": expected} | evidence
-        return graded("noisy", text, (fix, Do.DOCTOR()), is_bad=is_bad, is_warning=is_noisy, **evidence)
+        return graded("noisy", text, fix, is_bad=is_bad, is_warning=is_noisy, **evidence)
     if abs(bias) > MAX_BIAS_DPS:
         return bad("large_bias", f"{zero}: outside the datasheet", "Replace the sensor", **evidence)
     return fine("at_rest", f"at rest: {noise}, {zero}", **evidence)
@@ -228,7 +220,7 @@ def _gravity(context: DoctorContext, sensor: Imu) -> Finding:
     along = float(gravity["xyz".index(axis)])
     evidence: dict[str, Any] = {"gravity_g": [round(float(g), 4) for g in gravity], "size_g": size, "axis": axis}
     if not 0.8 < size < 1.2:
-        fix: SomeSteps = ("Check the sensor's supply, then", Do.DOCTOR())
+        fix: SomeSteps = "Check the sensor's supply"
         return bad("wrong_gravity", "gravity is {size_g:.2f} g", fix, **evidence)
     if abs(along) < UPRIGHT * size:
         upright = "xyz"[int(np.abs(gravity).argmax())]

@@ -68,7 +68,7 @@ def _elsewhere(context: DoctorContext, wire: SerialConnection) -> Finding:
     there = [found for scan in scans for found in scan.servos]
     text = "no servo answers at id {id}, {baud} baud, {port}"
     if not there:
-        fix = ("Check the servo's cable and switch on its 12 V supply (its LED blinks once), then", Do.DOCTOR())
+        fix = "Check the servo's cable and switch on its 12 V supply (its LED blinks once)"
         return bad("no_servo", f"{text}, nor any other at any baud rate", fix, **_place(config))
     obstacle = there[0].obstacle if len(there) == 1 else None
     use = obstacle[1] if obstacle else Do.SETUP()
@@ -105,7 +105,7 @@ def duplicate_id(port: str, scan: BaudScan) -> Finding:
 def foreign_bytes(port: str, scan: BaudScan) -> Finding:
     """Return the finding that something else than a servo sends on a bus."""
     text = "{port}: bytes at {baud} baud that belong to no servo: another program or adapter, or a loose contact"
-    fix = ("Remove everything but servos from the bus, then", Do.DOCTOR())
+    fix = "Remove everything but servos from the bus"
     return warning("foreign_bytes", text, fix, port=port, baud=scan.baud)
 
 
@@ -154,7 +154,7 @@ def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Finding:
     after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
         text = "frozen: its own clock stood at {tick_ms} ms during {readings} readings: its readings are not valid"
-        fix: SomeSteps = ("Switch the servo's supply off and on, then", Do.DOCTOR())
+        fix: SomeSteps = "Switch the servo's supply off and on"
         return bad("servo_frozen", text, fix, tick_ms=ticks, readings=READS)
     again = after["retries"] - before["retries"]
     quality: dict[str, Any] = {"readings": READS, "reading_ms": each_ms, "retries": again}

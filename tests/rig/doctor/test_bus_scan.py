@@ -279,24 +279,8 @@ def test_doctor_names_the_nearest_mode():
         assert problems["mode_not_offered"] == (Do.SETUP(),)
 
 
-@pytest.mark.parametrize(
-    ("compatible", "hertz", "warned"),
-    [
-        ("brcm,bcm2711-i2c", 0, True),
-        ("brcm,bcm2835-i2c", 400_000, True),
-        ("brcm,bcm2711-i2c", 10_000, False),
-        ("snps,designware-i2c", 100_000, False),  # Raspberry Pi 5
-        ("i2c-gpio", 0, False),
-    ],
-)
-def test_controller_that_cannot_wait_for_a_bno055_is_named(compatible, hertz, warned):
-    with unopened("imu.model=bno055", plugged=False) as bench:
-        bench.computer.serial_port()
-        bench.computer.camera()
-        bench.computer.i2c_bus(compatible=compatible, hertz=hertz)
-        problems = bench.problems("imu")
-        assert ("clock_stretching" in problems) == warned
-        bench.devices.i2c.stretch_errors = 0.2 if warned else 0.0
+def test_bus_that_does_not_wait_for_a_bno055_is_reported_with_the_slower_one():
+    with unopened("imu.model=bno055") as bench:
+        bench.devices.i2c.stretch_errors = 0.2
         bench.devices.world.clock.sleep(2.0)
-        again = bench.problems("imu")
-        assert any("i2c_arm_baudrate=10000" in str(fix) for fix in again.values()) == warned
+        assert any("i2c_arm_baudrate=10000" in str(fix) for fix in bench.problems("imu").values())

@@ -137,7 +137,7 @@ def test_set_up_is_proposed_if_other_devices_are_connected():
     with unopened(plugged=False) as bench:
         missing = [f for f in bench.findings("port") if f.code == "not_connected"]
         assert [f.evidence["found"] for f in missing] == [[]] * 3
-        assert [f.steps[-1] for f in missing] == [Do.FIND(), "sudo modprobe i2c-dev", Do.FIND()]
+        assert [f.fix for f in missing] == ["Plug the adapter in", "sudo modprobe i2c-dev", "Connect the camera"]
         bench.computer.serial_port("ttyUSB3", serial="FT7")
         bench.computer.i2c_bus(4)
         bench.computer.camera(2, "Cam")
