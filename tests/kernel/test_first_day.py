@@ -44,7 +44,7 @@ def test_setup_writes_the_configuration_and_checks_it(first_day: FirstDay) -> No
     assert "✗ servo       EEPROM Operating Mode: 3 → 4" in output
     assert "✓ imu         MPU-6050 at 0x68" in output
     assert "✓ camera      frames timed by stamped exposure" in output
-    assert "✓ camera      locked and read back: exposure 10 ms, white balance 5000 K, gain 0" in output
+    assert "✓ camera      locked and read back: exposure_us 10000, white_balance_k 5000, gain 0" in output
     assert "✓ port        latency timer of /dev/ttyUSB0 is 1 ms" in output
 
 
