@@ -70,12 +70,12 @@ class DeviceScan:
         if (problem := access(context, port, "dialout")).steps:
             yield problem
             return
-        # A head is not asked for servos, whose bytes it does not know.
-        head = context.config.imu.connection == "head" and context.config.head.port
-        is_head = bool(head) and context.computer.same_file(port.path, str(head))
+        # A known head is not asked for servos. Another one sends all the time, which is noise at any baud rate.
+        config = context.config
+        is_head = config.imu.connection == "head" and context.computer.same_file(port.path, config.head.port)
         try:
-            found = [] if is_head else self._servos(context, port)
-            found = found or self._head(context, port)
+            servos, noise = ([], []) if is_head else self._servos(context, port)
+            found = servos + noise if servos else self._head(context, port) or noise
         except DeviceNotFound as error:
             yield of_error(error)
         except (serial.SerialException, OSError) as error:
@@ -88,7 +88,8 @@ class DeviceScan:
                 fix = "Check the servo's cable and switch on its supply"
                 yield warning("nothing_on_port", text, fix, port=port.path, name=port.name)
 
-    def _servos(self, context: DoctorContext, port: SerialPort) -> list[Finding]:
+    def _servos(self, context: DoctorContext, port: SerialPort) -> tuple[list[Finding], list[Finding]]:
+        """Return which servos answer at a port, and at which baud rates there is noise."""
         with closing(context.computer.open_serial(port.path, BAUD_RATES[0])) as wire:
             scans = scan_servos(wire, context.computer.clock, preferred=context.config.servo.baud)
         findings = []
@@ -104,7 +105,7 @@ class DeviceScan:
             findings.append(fine("servo_found", "{port}: {found}", found=found, **place))
         self._has_duplicate_ids |= any(scan.duplicate_ids for scan in scans)
         findings += [duplicate_id(port.path, scan) for scan in scans if scan.duplicate_ids]
-        return findings + [foreign_bytes(port.path, scan) for scan in scans if scan.noise]
+        return findings, [foreign_bytes(port.path, scan) for scan in scans if scan.noise]
 
     def _head(self, context: DoctorContext, port: SerialPort, model: str | None = None) -> list[Finding]:
         """Return what a rig head at a port says; nothing if there is none.

@@ -185,15 +185,10 @@ def test_every_number_has_finite_limits(setting):
         load_config(None, [setting])
 
 
-@pytest.mark.parametrize("extreme", ["1e-320", "1e300", "inf", "nan"])
+@pytest.mark.parametrize("extreme", ["1e300", "-1e300", "inf", "-inf", "nan"])
 def test_no_number_can_be_extreme(extreme):
-    numbers = [info for info in key_info(RigConfig) if isinstance(info.default, float) or "a number" in info.allowed]
-    assert len(numbers) > 30
-    for info in numbers:
-        accepted = []
-        for value in (extreme, f"-{extreme}"):
-            try:
-                accepted.append(load_config(None, [f"{info.name}={value}"]))
-            except ConfigError:
-                continue
-        assert not accepted or extreme == "1e-320", info.name
+    names = {info.name for info in key_info(RigConfig) if isinstance(info.default, float) or "a number" in info.allowed}
+    assert len(names) > 30
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [f"{name}={extreme}" for name in names])
+    assert {mistake.partition(":")[0] for mistake in caught.value.evidence["mistakes"]} == names

@@ -17,6 +17,7 @@ from rig.doctor.checks import CHECKS
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.examination import Check, run_checks
 from rig.doctor.finding import Severity, fine
+from rig.doctor.servo_scan import BaudScan
 from sim.faults import Fault, Faults, fault_kinds
 from tests.rig.calibrations.test_calibrations import RESULT
 from tests.rig.catalog.catalog_samples import fill
@@ -235,6 +236,15 @@ def test_search_names_the_sensor_on_a_rig_head():
         bench.devices.imu.who_am_i = 0x00
         codes = {one.evidence.get("error_code") for one in run_checks(bench.context, DeviceScan().checks)}
         assert DeviceMismatch.code in codes
+
+
+def test_search_finds_a_rig_head_that_sends_all_the_time(monkeypatch):
+    with unopened("imu.connection=head", "head.port=/dev/ttyUSB1") as bench:
+        bench.computer.serial_port("ttyUSB1", serial="HEAD")
+        before = bench.context.config.imu.model_copy(update={"connection": "i2c"})  # it is not configured yet
+        bench.context.config = bench.context.config.model_copy(update={"imu": before})
+        monkeypatch.setattr("rig.doctor.device_scan.scan_servos", lambda *_, **__: [BaudScan(57_600, noise=True)])
+        assert [one.code for one in DeviceScan().find_servos(bench.context)] == ["foreign_bytes", "head"]
 
 
 def test_servo_behind_the_relay_is_not_reported_missing():
