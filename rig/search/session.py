@@ -226,25 +226,36 @@ class Search(ABC):
         return _no_step()
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        """Return the answer after the last view."""
+        """Return the answer after the last view. The arguments are what the search took."""
         self.decide()
+        return replace(self._answer(), travelled_deg=travelled_deg, seconds=seconds)
+
+    @abstractmethod
+    def _answer(self) -> Identified: ...
+
+    def _identified(
+        self, outcome: hbr.Outcome, possible: Sequence[str], yaw_set_deg: Sequence[float], **others: Any
+    ) -> Identified:
+        """Return the answer of a decided search; ``others`` are further fields of `Identified`."""
         best = self.ranked.candidates[0]
         end = self.step if isinstance(self.step, Finish) else Finish(hbr.StopReason.MAX_VIEWS)
+        is_unknown = outcome is hbr.Outcome.UNKNOWN
         return Identified(
-            name=best.name,
+            name=None if is_unknown else best.name,
             candidates=self.ranked.candidates,
             score=best.score,
             margin=self.ranked.margin,
             pose_deg=best.pose_deg,
-            yaw_deg=(yaw_deg := float(wrap360(self._orientations[-1] - best.pose_deg))),
-            yaw_set_deg=(yaw_deg,),
+            yaw_deg=yaw_set_deg[0] if len(yaw_set_deg) == 1 else None,
+            yaw_set_deg=tuple(yaw_set_deg),
             views=self.views,
-            travelled_deg=travelled_deg,
-            seconds=seconds,
+            travelled_deg=0.0,
+            seconds=0.0,
             reason=end.reason,
-            outcome=hbr.Outcome.FOUND,
-            possible=(best.name,),
+            outcome=outcome,
+            possible=() if is_unknown else tuple(possible),
             note=end.note,
+            **others,
         )
 
 
@@ -264,25 +275,21 @@ class PaperSearch(Search):
         given, repeatability = self.config.identify.min_score, self.config.identify.repeatability
         self.min_score = hbr.open_set_threshold(self.enrolled, repeatability=repeatability) if given is None else given
 
-    def _by_score(self, answer: Identified, possible: Sequence[str], object_index: int, **others: Any) -> Identified:
+    def _by_score(self, possible: Sequence[str], object_index: int, **others: Any) -> Identified:
         """Return the answer by its score and its possible objects, with all rotations by the measured symmetry."""
         outcome = hbr.Outcome.FOUND if len(possible) == 1 else hbr.Outcome.AMBIGUOUS
-        if answer.score < self.min_score:
-            outcome, possible = hbr.Outcome.UNKNOWN, ()
+        if self.score < self.min_score:
+            outcome = hbr.Outcome.UNKNOWN
+        if outcome is not hbr.Outcome.FOUND:
+            others["confidence"] = None
         own = symmetry(self.enrolled, object_index)
         period_deg = own.period_deg if own else None
+        # An object without a measured symmetry has one pose, one that looks the same from all sides has none.
         poses = round(360 / period_deg) if period_deg else 1 if period_deg is None else 0
-        yaw_deg = answer.yaw_set_deg[0]
-        return replace(
-            answer,
-            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
-            outcome=outcome,
-            possible=tuple(possible),
-            min_score=self.min_score,
-            yaw_deg=yaw_deg if poses == 1 else None,
-            yaw_set_deg=tuple(wrap360(yaw_deg + k * 360 / poses) for k in range(poses)),
-            period_deg=period_deg,
-            **others,
+        yaw_deg = float(wrap360(self._orientations[-1] - self.ranked.candidates[0].pose_deg))
+        yaw_set_deg = [float(wrap360(yaw_deg + k * 360 / poses)) for k in range(poses)]
+        return self._identified(
+            outcome, possible, yaw_set_deg, min_score=self.min_score, period_deg=period_deg, **others
         )
 
 
@@ -311,15 +318,12 @@ class HoughSearch(PaperSearch):
         )
         return Ranked(views - 1, candidates, hbr.score_margin(ranking, queries) / views)
 
-    def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
-        possible = answer.possible
-        if answer.margin <= 0 and len(self.ranking.names) > 1:
-            # Objects that share the best score; at least the second one, which is as likely by the margin.
-            scores = self.ranking.scores
-            possible = self.ranking.names[: max(2, int((scores >= scores[0]).sum()))]
-        first = int(self.ranking.object_index[0])
-        return self._by_score(answer, possible, first, min_margin=self.config.identify.margin)
+    def _answer(self) -> Identified:
+        names, scores = self.ranking.names, self.ranking.scores
+        # Objects that share the best score; at least the second one, which is as likely by the margin.
+        shared = self.ranked.margin <= 0 and len(names) > 1
+        possible = names[: max(2, int((scores >= scores[0]).sum()))] if shared else names[:1]
+        return self._by_score(possible, int(self.ranking.object_index[0]), min_margin=self.config.identify.margin)
 
 
 @dataclass(eq=False)
@@ -363,13 +367,10 @@ class PoseSearch(PaperSearch):
         margin = float(score[0] - score[1:].max(initial=0.0))
         return Ranked(views - 1, candidates[: self.top], margin)
 
-    def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
+    def _answer(self) -> Identified:
         count = 1 + int((np.cumsum(self._probability) < CONFIDENT).sum())
         possible = [self.names[j] for j in self._objects[:count].tolist()]
-        answer = self._by_score(answer, possible, int(self._objects[0]), min_confidence=CONFIDENT)
-        found = answer.outcome is hbr.Outcome.FOUND
-        return replace(answer, confidence=self.probability if found else None)
+        return self._by_score(possible, int(self._objects[0]), min_confidence=CONFIDENT, confidence=self.probability)
 
 
 @dataclass(eq=False)
@@ -460,24 +461,17 @@ class DenseSearch(Search):
         own, orientations_deg = hypotheses[self.session.left_out :], self._orientations[self.session.left_out :]
         return lambda n: [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
 
-    def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
+    def _answer(self) -> Identified:
         decision = self.session.end()
-        outcome = decision.outcome
-        possible = self._possible(decision)
         found = pose(self.session.belief, decision.object_index)
-        yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
-        return replace(
-            answer,
-            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
+        return self._identified(
+            decision.outcome,
+            self._possible(decision),
+            [float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg],
             left_out=tuple(LeftOut(n, LeftOutReason.OBJECT_CHANGED) for n in range(self.session.left_out)),
-            outcome=outcome,
-            possible=possible,
-            yaw_deg=yaws_deg[0] if len(yaws_deg) == 1 else None,
             yaw_sigma_deg=found.sigma_deg,
-            yaw_set_deg=yaws_deg,
             period_deg=found.period_deg,
-            confidence=decision.probability if outcome is hbr.Outcome.FOUND else None,
+            confidence=decision.probability if decision.outcome is hbr.Outcome.FOUND else None,
             min_confidence=decision.min_confidence,
             not_enrolled=decision.not_enrolled,
         )
@@ -487,8 +481,6 @@ class DenseSearch(Search):
 
         With "not enrolled", they reach the confidence together.
         """
-        if decision.outcome is hbr.Outcome.UNKNOWN:
-            return ()
         count = 1
         if decision.outcome is hbr.Outcome.AMBIGUOUS:
             together = decision.not_enrolled + np.cumsum(self._probability()[self._order])
