@@ -78,10 +78,6 @@ class ViewsAtRest:
     bench: Bench
     model: Model
     search: Search
-    viewer: Viewer
-    describe: SearchDescriber
-    check: ObjectCheck
-    """Gets image and azimuth of each view, and raises an error if the table is empty."""
     live: Callable[[FrameUsed], object]
     """Called with the event of each frame of a search in motion."""
     first_rest_s: float = FIRST_REST_S
@@ -90,6 +86,7 @@ class ViewsAtRest:
     travelled_deg: float = 0.0
     is_over: bool = False
     started_ns: int = field(init=False)
+    """When the object was on the table."""
     ended_ns: int = field(init=False)
     """When the last view was decided."""
     settled_ns: int = field(init=False)
@@ -100,9 +97,21 @@ class ViewsAtRest:
     _missing: CatalogError | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        self.table = Turntable(self.bench, first_rest_s=self.first_rest_s)
-        self.sign = self.bench.config.table.orientation_sign  # the camera moves opposite to the table
-        self.started_ns = self.bench.clock.now_ns()
+        bench, search = self.bench, self.search
+        self.table = Turntable(bench, first_rest_s=self.first_rest_s)
+        self.sign = bench.config.table.orientation_sign  # the camera moves opposite to the table
+        self.viewer = Viewer(bench.camera, bench.config)
+        empty_table, self.notes = empty_table_for(bench, self.model)
+        self.describe = SearchDescriber(
+            bench.config.view,
+            search.descriptor,
+            empty_table,
+            revise=not search.in_motion,
+            enrolled_table=self.model.empty_table,
+        )
+        # A search without an empty-table image still notices an empty table by that of the bench.
+        own = empty_table_status(bench).table if empty_table is None else None
+        self.check = ObjectCheck(bench, empty_table if own is None else own.image_bgr)
 
     @property
     def seconds(self) -> float:
@@ -299,14 +308,8 @@ def identify(
 ) -> Generator[Event, None, Identified]:
     """Identify the object on the table; yields events and returns the answer.
 
-    After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). ``dense`` is the
-    bench's own: it takes the next best view until an object, or "not enrolled", is probable enough. ``ahbr`` is the
-    paper's: the first rotation is fixed, and each further one leads to the side on which the candidates look less
-    similar (Eq. 5-7). The search ends when an enrolled object leads all others by ``identify.margin`` per view, or
-    after ``identify.max_views``. The object is unknown if its score per view is below ``identify.min_score``; the
-    default comes from the scores of the enrolled views among each other (`hbr.open_set_threshold`). ``hmm``, the
-    successor of the paper, ends when an object has a probability of 98 %, or after ``identify.max_views``, and calls
-    objects unknown like ``ahbr``. Closing the generator turns the torque off.
+    After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). Closing the
+    generator turns the torque off.
 
     The model is from `rig.search.model.load_model` or `rig.search.model.model_of`. The default strategy is the one that
     the model is for; ``seed`` is for those that draw random numbers. ``config`` are settings of the search that are not
@@ -325,18 +328,8 @@ def identify(
     search = begin_search(model, config, strategy, seed=seed, top=top)
     if search.in_motion:
         require_camera_time(bench.config)
-    viewer = Viewer(bench.camera, bench.config)
     check_camera(bench, model.camera)
-    empty_table, about_table = empty_table_for(bench, model)
-    own = empty_table_status(bench).table if empty_table is None else None
-    describe = SearchDescriber(
-        bench.config.view,
-        search.descriptor,
-        empty_table,
-        revise=not search.in_motion,
-        enrolled_table=model.empty_table,
-    )
-    check = ObjectCheck(bench, empty_table if own is None else own.image_bgr)
+    views = (ViewsInMotion if search.in_motion else ViewsAtRest)(bench, model, search, live)
     (placer or bench).place(None)
     yield Started(
         "identify",
@@ -346,11 +339,10 @@ def identify(
         strategy=search.strategy.name,
         seed=seed,
         descriptor=search.descriptor,
-        notes=(*model.notes, *about_table),
+        notes=(*model.notes, *views.notes),
     )
     # Take views until the search ends.
-    kind = ViewsInMotion if search.in_motion else ViewsAtRest
-    views = kind(bench, model, search, viewer, describe, check, live)
+    views.started_ns = bench.clock.now_ns()
     try:
         with views.table as table:
             yield from views.begin()

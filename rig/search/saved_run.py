@@ -13,8 +13,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version as version_of
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Literal, Self, TextIO
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -73,58 +72,56 @@ class About(BaseModel):
     config: RigConfig
 
 
-class RunWriter:
-    """Stores one search while it runs: after an interruption the folder contains all events so far."""
+@contextmanager
+def save_run(
+    folder: Path, bench: Bench, model: Model, config: RigConfig | None = None
+) -> Iterator[Callable[[Event], None]]:
+    """Return a function, in a ``with`` block, that stores the next event of one search; an error is stored, too.
 
-    def __init__(self, folder: Path, bench: Bench, model: Model, config: RigConfig | None = None) -> None:
-        self._folder = folder
-        views = model.views
-        kind = descriptor(views.descriptor)
+    After an interruption the folder contains all events so far; a frame is in the folder before its event.
+
+    Raises `UsageError`: the folder is not empty, or the disk is full or fails.
+    """
+    views = model.views
+    kind = descriptor(views.descriptor)
+    with _writing(folder):
+        (folder / "frames").mkdir(parents=True, exist_ok=True)
+        if len(list(folder.iterdir())) > 1:
+            raise UsageError(f"The folder {folder} is not empty.", next_step="Give a new folder for each run.")
+        write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
+        empty_table, _ = empty_table_for(bench, model)
+        if empty_table is not None:
+            write(folder / EMPTY_TABLE, images.encode(empty_table))
+        about = About(
+            software=f"hbr-rig {version_of('hbr-rig')}",
+            started_utc=bench.clock.utc(),
+            bench=bench.name,
+            devices=plain(bench.devices()),
+            conditions=plain(bench.conditions),
+            findings=plain(bench.findings),
+            descriptor=DescriptorUsed(name=kind.name, version=kind.version),
+            config=config or bench.config,
+        )
+        text = about.model_dump_json(indent=2, exclude={"config": {"serve"}})  # it has the tokens
+        write(folder / "run.json", f"{text}\n".encode())
+        lines = (folder / "events.jsonl").open("x", encoding="utf-8")
+
+    def store(value: dict[str, Any]) -> None:
+        lines.write(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str) + "\n")
+        lines.flush()
+
+    def save(event: Event) -> None:
         with _writing(folder):
-            (folder / "frames").mkdir(parents=True, exist_ok=True)
-            if len(list(folder.iterdir())) > 1:
-                raise UsageError(f"The folder {folder} is not empty.", next_step="Give a new folder for each run.")
-            write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
-            empty_table, _ = empty_table_for(bench, model)
-            if empty_table is not None:
-                write(folder / EMPTY_TABLE, images.encode(empty_table))
-            about = About(
-                software=f"hbr-rig {version_of('hbr-rig')}",
-                started_utc=bench.clock.utc(),
-                bench=bench.name,
-                devices=plain(bench.devices()),
-                conditions=plain(bench.conditions),
-                findings=plain(bench.findings),
-                descriptor=DescriptorUsed(name=kind.name, version=kind.version),
-                config=config or bench.config,
-            )
-            text = about.model_dump_json(indent=2, exclude={"config": {"serve"}})  # it has the tokens
-            write(folder / "run.json", f"{text}\n".encode())
-            self._events: TextIO = (folder / "events.jsonl").open("x", encoding="utf-8")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if isinstance(error, RigError):
-            self._line(plain(error.problem))
-        self._events.close()
-
-    def add(self, event: Event) -> None:
-        """Store the next event; a frame is in the folder before its event.
-
-        Raises `UsageError`: the disk is full or fails.
-        """
-        with _writing(self._folder):
             if isinstance(event, Accepted):
-                write(self._folder / _frame_file(event.index), images.encode(event.image_bgr))
-            self._line(event_dict(event))
+                write(folder / _frame_file(event.index), images.encode(event.image_bgr))
+            store(event_dict(event))
 
-    def _line(self, value: dict[str, Any]) -> None:
-        self._events.write(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str) + "\n")
-        self._events.flush()
+    with lines:
+        try:
+            yield save
+        except RigError as error:
+            store(plain(error.problem))
+            raise
 
 
 @contextmanager
@@ -133,22 +130,22 @@ def saving(
 ) -> Iterator[Callable[[Event], None]]:
     """Return a function, in a ``with`` block, that saves events: each search in the folder of ``next_folder``.
 
-    Without ``next_folder`` it saves nothing. Errors as for `RunWriter`.
+    Without ``next_folder`` it saves nothing. Errors as for `save_run`.
     """
     with ExitStack() as search:
-        writer: RunWriter | None = None
+        save: Callable[[Event], None] | None = None
 
-        def save(event: Event) -> None:
-            nonlocal writer
+        def add(event: Event) -> None:
+            nonlocal save
             if next_folder is not None and isinstance(event, Started):
-                writer = search.enter_context(RunWriter(next_folder(), bench, model(), config))
-            if writer is not None:
-                writer.add(event)
+                save = search.enter_context(save_run(next_folder(), bench, model(), config))
+            if save is not None:
+                save(event)
                 if isinstance(event, Identified | Failed):
                     search.close()
-                    writer = None
+                    save = None
 
-        yield save
+        yield add
 
 
 @dataclass(frozen=True, slots=True)

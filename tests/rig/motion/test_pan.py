@@ -16,10 +16,11 @@ from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
 from rig.search.model import load_model, model_of
 from rig.search.replay import check
-from rig.search.saved_run import RunWriter, load_run
+from rig.search.saved_run import load_run
 from rig.search.strategies import descriptor_for
 from rig.search.strategies import strategy as strategy_named
 from sim.objects.solid import empty_platter
+from tests.rig.search.run_samples import searched
 
 PAN = ("table.mode=pan", "table.limits_deg=[-150, 150]")
 ARM = ("table.carries=camera",)
@@ -71,17 +72,15 @@ def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strat
             assert len(views) == 8
         s.operator.next_object, s.operator.yaw_deg = "teapot", 10.0
         model = load_model(catalog, descriptor=descriptor_for(strategy_named(strategy)))
-        with RunWriter(tmp_path / "run", s.bench, model) as writer:
-            for event in identify(s.bench, model, strategy=strategy):
-                writer.add(event)
-                views += [event] if isinstance(event, Accepted) else []
+        *events, answer = searched(tmp_path / "run", s.bench, model, strategy=strategy)
+        views += [event for event in events if isinstance(event, Accepted)]
         stored = catalog.object("mug-dots").complete
         methods = {one["method"] for one in described(catalog.database, stored, "mug-dots").segmentation}
     again = check(load_run(tmp_path / "run"))
     assert again.is_complete
     assert again.differences == []
-    assert isinstance(event, Identified)
-    assert event.name == "teapot"
+    assert isinstance(answer, Identified)
+    assert answer.name == "teapot"
     used = {view.segmentation["method"] for view in views if view.segmentation is not None}
     if photographs:
         assert methods == used == {BoxMethod.EMPTY_TABLE}

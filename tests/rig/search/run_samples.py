@@ -2,21 +2,33 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from rig.bench import Bench
 from rig.catalog import Catalog, derived
 from rig.config import load_config
 from rig.events.events import Event
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
-from rig.search.model import load_model, model_of
-from rig.search.saved_run import RunWriter
+from rig.search.model import Model, load_model, model_of
+from rig.search.saved_run import save_run
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.small import SMALL
 
 Runs = dict[str, tuple[Path, list[Event]]]
+
+
+def searched(folder: Path, bench: Bench, model: Model, **options: Any) -> list[Event]:
+    """Identify the object on the table, save the run, and return its events."""
+    events = []
+    with save_run(folder, bench, model) as save:
+        for event in identify(bench, model, **options):
+            save(event)
+            events.append(event)
+    return events
 
 
 def saved_runs(home: Path, strategies: Sequence[str] = ("ahbr", "hbr", "sweep", "random")) -> Runs:
@@ -34,18 +46,8 @@ def saved_runs(home: Path, strategies: Sequence[str] = ("ahbr", "hbr", "sweep", 
         index = model_of(derived.views(catalog))
         for number, strategy in enumerate(strategies):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number
-            with RunWriter(home / strategy, bench, index) as writer:
-                events = []
-                for event in identify(bench, index, strategy=strategy, seed=number, top=2):
-                    writer.add(event)
-                    events.append(event)
+            events = searched(home / strategy, bench, index, strategy=strategy, seed=number, top=2)
             runs[strategy] = home / strategy, events
-        model = load_model(catalog)
         operator.next_object, operator.yaw_deg = "mug-star", 70.0
-        with RunWriter(home / "dense", bench, model) as writer:
-            events = []
-            for event in identify(bench, model, top=2):
-                writer.add(event)
-                events.append(event)
-        runs["dense"] = home / "dense", events
+        runs["dense"] = home / "dense", searched(home / "dense", bench, load_model(catalog), top=2)
     return runs

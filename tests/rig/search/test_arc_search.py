@@ -16,7 +16,7 @@ from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, R
 from rig.report.report import run_report
 from rig.search.model import Model
 from rig.search.replay import check
-from rig.search.saved_run import RunWriter, load_run
+from rig.search.saved_run import load_run, save_run
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault
 from sim.objects.shelf import shelf
@@ -46,10 +46,10 @@ def moving(world: World, *settings: str, faults: tuple[str, ...] = ()) -> Bench:
 
 def test_search_ends_during_the_rotation_and_can_be_replayed(model: Model, tmp_path: Path) -> None:
     live: list[FrameUsed] = []
-    with moving(World(seed=2)) as bench, RunWriter(tmp_path / "run", bench, model) as writer:
+    with moving(World(seed=2)) as bench, save_run(tmp_path / "run", bench, model) as save:
         events = []
         for event in identify(bench, model, live=live.append):
-            writer.add(event)
+            save(event)
             events.append(event)
             if isinstance(event, Accepted) and event.evidence.motion is not None:
                 assert live  # its event was reported during the rotation

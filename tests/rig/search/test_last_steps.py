@@ -21,10 +21,11 @@ from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.search.model import load_model
 from rig.search.replay import check
-from rig.search.saved_run import RunWriter, load_run
+from rig.search.saved_run import load_run
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import twins
 from sim.world import World
+from tests.rig.search.run_samples import searched
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]", "identify.max_views=2")
 
@@ -83,10 +84,7 @@ def test_a_doubtful_leader_is_verified_and_the_run_replays(
     monkeypatch.setattr(stopping, "_models", lambda: defaultdict(lambda: Fixed(-1.0, after)))
     for least in ("MIN_CONFIDENCE", "LAST_CONFIDENCE"):
         monkeypatch.setattr(stopping, least, 0.55)  # twins share the probability
-    with RunWriter(tmp_path / "run", bench, model) as writer:
-        events = list(identify(bench, model))
-        for event in events:
-            writer.add(event)
+    events = searched(tmp_path / "run", bench, model)
     *_, found = (event for event in events if isinstance(event, Verified))
     answer = events[-1]
     assert isinstance(answer, Identified)
