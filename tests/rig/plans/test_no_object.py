@@ -43,20 +43,18 @@ def world():
 
 
 @pytest.fixture
-def bench(world):
-    """A bench with a calibrated camera time and an empty-table image. Its operator puts no object on the table."""
+def plain_bench(world):
+    """A bench with a calibrated camera time. Its operator puts no object on the table."""
     with open_sim_bench(camera_time(world, *SMALL), ShelfOperator(world, shelf())) as bench:
-        list(photograph_table(bench))
         bench.placer = None
         yield bench
 
 
 @pytest.fixture
-def plain_bench(world):
-    """The same bench without an empty-table image."""
-    with open_sim_bench(camera_time(world, *SMALL), ShelfOperator(world, shelf())) as bench:
-        bench.placer = None
-        yield bench
+def bench(plain_bench):
+    """The same bench with an empty-table image."""
+    list(photograph_table(plain_bench))
+    return plain_bench
 
 
 @pytest.fixture
@@ -145,8 +143,10 @@ def test_operator_of_a_tray_can_put_the_object_on_the_table_and_try_again(bench,
 def test_watch_reports_an_empty_table_and_waits_for_the_next_object(bench, model, world):
     answers = []
     for event in watch(bench, lambda: identify(bench, model, strategy="dense")):
-        if isinstance(event, Waiting) and answers:
-            world.put(shelf()["lamp"])
+        if isinstance(event, Waiting):
+            assert world.table_deg() == pytest.approx(0.0, abs=1.0)  # where the first object was waited for
+            if answers:
+                world.put(shelf()["lamp"])
         if isinstance(event, Failed | Identified):
             answers.append(event.error.code if isinstance(event, Failed) else event.name)
             if len(answers) == 2:

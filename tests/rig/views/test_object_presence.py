@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 
 from hbr.evaluation.photographs import load_coil
-from rig.catalog import Catalog, derived
 from rig.config import ViewConfig
 from rig.core.errors import DeviceSilent
-from rig.events.events import Failed, Identified, Waiting
-from rig.plans.enroll import enroll
-from rig.plans.identify import identify, watch
-from rig.search.model import model_of
 from rig.views.object_presence import TableWatcher, is_empty_table, probability_of_nothing
 from sim.motion import rest
 from sim.objects.shelf import shelf
@@ -178,30 +173,3 @@ def test_no_photographed_object_is_taken_for_nothing(rig_test_data, name):
             dimmed = np.clip(0.7 * rotated, 0, 255).astype(np.uint8)
             for later in (rotated, dimmed, again):  # the last one: an object that is the same from all sides
                 assert probability_of_nothing(first, later, config) is None, (item.name, start)
-
-
-def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_path):
-    s = simulated("identify.max_views=4", seed=7)
-    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        for name in ("toy-car", "book-night"):
-            list(enroll(s.bench, catalog, name, views=6))
-        index = model_of(derived.views(catalog))
-    s.world.put(None)
-    s.bench.placer = TableWatcher(s.bench)
-    upcoming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]
-    answers = []
-    for event in watch(s.bench, lambda: identify(s.bench, index)):
-        if isinstance(event, Waiting):
-            assert s.world.shaft()[0] == pytest.approx(
-                0.0, abs=1.0
-            )  # the angle of the empty-table frame, with the cable unwound
-            name, yaw_deg = upcoming.pop(0)
-            s.world.change(light=(1.0, 1.0, 1.0))
-            at(s, 4.0, put(s, name, yaw_deg))
-            if name == "radio":  # the light goes out after the object was detected
-                at(s, 6.2, lambda: s.world.change(light=(0.0, 0.0, 0.0)))
-        if isinstance(event, Failed | Identified):
-            answers.append(event.error.code if isinstance(event, Failed) else event.name)
-            if not upcoming:
-                break
-    assert answers == ["toy-car", 600, "book-night"]
