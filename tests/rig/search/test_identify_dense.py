@@ -6,8 +6,20 @@ import numpy as np
 import pytest
 
 import hbr
+from hbr.core.angles import wrap180
 from rig.catalog import Catalog
-from rig.events.events import Accepted, Decided, Identified, Note, NoteCode, Ranked, RotationReason, Started, Warned
+from rig.events.events import (
+    Accepted,
+    Decided,
+    Identified,
+    Moved,
+    Note,
+    NoteCode,
+    Ranked,
+    RotationReason,
+    Started,
+    Warned,
+)
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
@@ -116,9 +128,14 @@ def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simula
     s = simulated("table.limits_deg=[-180, 185]")
     events, answer = search(s, shelf, "radio")
     decided = [e for e in events if isinstance(e, Decided)]
+    _, *moves = [e for e in events if isinstance(e, Moved)]
     assert answer.name is None
-    assert len(decided) == answer.views - 1 >= 1
-    for event in decided:
+    assert len(decided) == len(moves) == answer.views - 1 >= 1
+    for event, move in zip(decided, moves, strict=True):
+        assert move.commanded_deg == pytest.approx(event.target_deg)
+        # The camera moves around the object against the table's rotation; whole revolutions unwind the cable.
+        assert wrap180(move.rotation_encoder_deg + event.rotation_deg) == pytest.approx(0, abs=0.5)
+        assert move.rotation_imu_deg == pytest.approx(move.rotation_encoder_deg, abs=4 * move.imu_sigma_deg + 0.3)
         assert -180 <= event.target_deg <= 185
         separates = event.reason is RotationReason.SEPARATES_CANDIDATES
         assert separates or event.reason in (RotationReason.NEW_SIDE, RotationReason.SEVERAL_POSES)
@@ -128,6 +145,8 @@ def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simula
         assert event.rotation_deg in weighed.rotations_deg
         sums = [a + b for a, b in zip(weighed.confusion, weighed.cost, strict=True)]
         assert sums[weighed.rotations_deg.index(event.rotation_deg)] == min(sums)
+    assert answer.travelled_deg == pytest.approx(sum(abs(e.rotation_encoder_deg) for e in moves))
+    assert not s.bench.servo.read_condition().torque
     for ranked in (e for e in events if isinstance(e, Ranked)):
         probability = [c.probability for c in ranked.candidates]
         assert probability == sorted(probability, reverse=True)
@@ -151,6 +170,21 @@ def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(sim
         probability = [one.probability for one in ranked[event.index].candidates]
         leading = probability[0] / sum(probability)  # among the enrolled objects
         assert (leading >= 0.95) == (event.reason is RotationReason.NEW_SIDE)
+
+
+def test_search_uses_the_gyro_when_the_platter_slips_a_little(simulated, shelf):
+    s = simulated()
+    s.operator.next_object = "radio"
+    moves = []
+    for event in identify(s.bench, shelf):
+        if isinstance(event, Decided) and not moves[1:]:
+            s.world.clock.call_at(s.world.clock.now_ns() + 500_000_000, lambda: s.world.slip(9.0, 0.2))
+        if isinstance(event, Moved):
+            moves.append(event)
+        if isinstance(event, Accepted) and event.index == 1:
+            off_deg = wrap180(event.azimuth_deg + s.world.table_deg())
+    assert not moves[1].agrees
+    assert off_deg == pytest.approx(0, abs=4 * moves[1].imu_sigma_deg)
 
 
 def test_rotation_of_a_round_object_is_not_stated(simulated, shelf):
