@@ -98,6 +98,7 @@ class FlightFrames:
         config = self.bench.config
         middle = middle_ns(frame.exposed_ns, config.camera_time)
         motion = trajectory.at([middle])
+        # The uncertainty of the angle includes the distance that the platter moves in that of the frame's time.
         speed_dps = abs(float(motion.rate_dps[0]))
         time_deg = speed_dps * time_sigma_ms(config) * 1e-3
         return checked(

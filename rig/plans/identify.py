@@ -131,6 +131,7 @@ class ViewsAtRest:
 
     def view(self) -> Generator[Event, None, None]:
         """Add an acceptable frame at rest to the search; errors as for `rig.plans.steps.capture`."""
+        # Take and describe a view; an empty table must end the plan before the search ranks it.
         captured = yield from capture(self.number, self.viewer, self.table, self.settled_ns)
         azimuth_deg = self.azimuth_deg
         described = self.describe(captured.image_bgr, azimuth_deg)
@@ -138,6 +139,7 @@ class ViewsAtRest:
         yield accepted(self.number, azimuth_deg, captured, described)
         self.check(captured.image_bgr, azimuth_deg)
         yield from warn_of_table(self.bench, self.number, described)
+        # Add it to the search; a comparison with enrolled views comes before the decision, because that depends on it.
         self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
         if (changed := self.search.changed()) is not None:
             yield changed

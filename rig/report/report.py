@@ -95,7 +95,7 @@ def render_report(
     meta: Meta,
 ) -> str:
     """Return the page, with ``summary`` as a sentence below the title; sections without content are left out."""
-    styles = Styles()
+    styles = Styles()  # one for the page, so that an object has one colour on it
     with_truth = any(record.truth is not None for record in identifications)
     return _template().render(
         title=title,

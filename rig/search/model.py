@@ -123,6 +123,7 @@ def load_model(
     Raises `UsageError`: there is no such descriptor. `CatalogError`, `CatalogBusy`: the catalog cannot be read, or a
     view cannot be described.
     """
+    # The views, and how old they are if they come from a local copy.
     views = derived.views(catalog, descriptor or BENCH_DESCRIPTOR, progress)
     copied = catalog.copied_utc
     notes: tuple[Note, ...] = ()
@@ -132,7 +133,8 @@ def load_model(
     model = Model(_index(views), notes, camera=camera)
     if not model.is_dense:
         return model
-    # Were the objects enrolled with an empty-table image?
+    # Views are compared only with views that were described in the same way, so the majority decides whether the
+    # search uses an empty-table image.
     before = sessions.empty_tables(catalog)
     with_image = len(before.with_image) >= len(before.without_image)
     others = before.without_image if with_image else before.with_image

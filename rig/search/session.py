@@ -185,6 +185,7 @@ class Search(ABC):
         if not self._is_decided:
             self._is_decided = True
             self.ranked = self._rank()
+            # A search in motion decides when its frames have covered another step of the circle, not at each frame.
             if self.is_new_decision:
                 self.step = self.strategy.next(self)
         assert self.step is not None
@@ -238,6 +239,7 @@ class Search(ABC):
     ) -> Identified:
         """Return the answer of a decided search; ``others`` are further fields of `Identified`."""
         best = self.ranked.candidates[0]
+        # A search in motion may end after its last flight although its strategy would rotate on.
         end = self.step if isinstance(self.step, Finish) else Finish(hbr.StopReason.MAX_VIEWS)
         is_unknown = outcome is hbr.Outcome.UNKNOWN
         return Identified(
@@ -354,6 +356,7 @@ class PoseSearch(PaperSearch):
     def _add(self, view: DescribedView) -> None:
         similar = self.model.compared.similarity(view.levels[self.descriptor][None])[0]
         self._so_far = self.belief = update_poses(similar, self._orientations[-1], self._so_far)
+        # The score knows no orientations: the most similar view of each object counts, wherever it was taken.
         self._reach += np.maximum.reduceat(similar[self._rows], self.model.begin)
 
     def _rank(self) -> Ranked:
@@ -411,6 +414,7 @@ class DenseSearch(Search):
     def _rank(self) -> Ranked:
         belief = self.session.belief
         self._scores = belief.scores()
+        # The most probable object first; of equally probable ones, that with the higher score.
         self._order = np.lexsort((-self._scores, -self.session.among_enrolled()))
         candidates = self._candidates()
         others = float(self._scores[self._order[1:]].max(initial=0.0))
@@ -458,6 +462,7 @@ class DenseSearch(Search):
         )
 
     def _queries(self, hypotheses: Hypotheses) -> Queries:
+        # Views from before a change show another object.
         own, orientations_deg = hypotheses[self.session.left_out :], self._orientations[self.session.left_out :]
         return lambda n: [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
 

@@ -217,6 +217,7 @@ class SearchDescriber(ViewSegmenter):
         if self._views is None:
             self._views = hbr.ViewsTogether(self._kind.name)
         found = self._views.add(part, background, revise=self._revise, keep=self._revise)[0]
+        # Whether this is the bench of the enrollment does not change during a search: the first view decides it.
         if len(self._views.segmentations) == 1:
             before, now = (table_image(one, image_bgr, azimuth_deg) for one in (self._enrolled_table, self.empty_table))
             if before is not None and now is not None:

@@ -105,6 +105,7 @@ def store_empty_table(bench: Bench, table: EmptyTable) -> None:
     png = images.encode(table.image_bgr)
     stored = table.model_copy(update={"image": f"empty-table-{images.digest(png)}.png"})
     before = _stored_if_readable(bench)
+    # The pixels are on the disk before the JSON file names them, so that at any time it names a complete image.
     bench.state.store_file(stored.image, png)
     _store(bench, stored)
     if before is not None and before.image != stored.image:

@@ -70,7 +70,7 @@ class TableWatcher:
             self._empty = first
         for now, still_s in frames:
             if still_s < STILL_S:
-                continue
+                continue  # a hand may still be there
             if not changed(self._empty, now):
                 self._empty, old = now, None  # follow slow changes of the daylight
             elif old is None or changed(old, now):

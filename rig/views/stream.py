@@ -54,6 +54,7 @@ class FrameStream:
         Raises `DeviceSilent`: the camera has failed.
         """
         after_ns = self._after_ns
+        # A program that is too slow for each frame would otherwise steer the table by ever older ones.
         if newest and self._last is not None:
             oldest_ns = self._clock.now_ns() - min(self._delay_ns, round(LATEST_S * 1e9)) - round(2e9 * self.period_s)
             if oldest_ns > after_ns:
