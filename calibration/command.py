@@ -1,4 +1,4 @@
-"""`rig calibrate ...`."""
+"""Measure the bench's own errors."""
 
 import inspect
 import sys
@@ -19,7 +19,7 @@ from rig.core.next_steps import Do, in_words
 if TYPE_CHECKING:
     from calibration.procedure import Procedure
 
-app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
+app = typer.Typer(help=__doc__, no_args_is_help=True)
 
 
 def run(settings: Settings, *procedures: "Procedure") -> None:

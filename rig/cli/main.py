@@ -11,7 +11,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points, version
 from importlib.util import find_spec
 from io import TextIOWrapper
-from pkgutil import resolve_name
+from pathlib import Path
 from typing import Annotated, Any, Final, Unpack, cast
 
 import typer
@@ -65,8 +65,7 @@ SECTIONS: Final[dict[str, dict[str, str | None]]] = {
 
 The first section is for each day.
 """
-PLACES: Final = {name: place for places in SECTIONS.values() for name, place in places.items()}
-GROUP = "rig.commands"
+GROUP: Final = "rig.commands"
 _WANTS_JSON = "rig.wants_json"
 _TYPER_USAGE_ERROR: Any = typer.BadParameter.__base__
 """Typer exports no name for it, and the module of the class depends on Typer's version."""
@@ -82,70 +81,55 @@ class _Subcommands(TyperGroup):
             )
 
 
-class _Table(Mapping[str, Any]):
-    """The commands by name. To import all of them takes a second, so each is imported and built when it is asked for.
-
-    ``registered`` are commands that Typer has built.
-    """
-
-    def __init__(self, registered: Mapping[str, Any]) -> None:
-        self._registered = registered
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**PLACES, **_plugins(), **self._registered})
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-    def __getitem__(self, name: str) -> Any:
-        if name in self._registered:
-            return self._registered[name]
-        place = PLACES.get(name)
-        found = _plugin(name) if place is None else resolve_name(f"{__package__}.{place}")
-        if found is None:
-            raise KeyError(name)
-        return _built(name, found)
+@cache
+def _places() -> dict[str, EntryPoint]:
+    """Return the places of all commands: of our own, and of the plug-ins."""
+    own = {name: f"{__package__}.{place}" for places in SECTIONS.values() for name, place in places.items() if place}
+    plugins = sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    return {point.name: point for point in (*(EntryPoint(*one, GROUP) for one in own.items()), *plugins)}
 
 
 @cache
-def _plugins() -> dict[str, EntryPoint]:
-    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
-
-
-@cache
-def _plugin(name: str) -> Any:
-    """Return the function or the group of a plug-in; None if there is none, or it cannot be loaded."""
-    point = _plugins().get(name)
+def _built(name: str) -> Any:
+    """Import a command, and return it with its options as a command of Typer; None if it cannot be loaded."""
+    point = _places()[name]
     try:
-        return None if point is None else point.load()
+        found = point.load()
     except Exception as broken:  # the other commands work without this plug-in
-        notice = f"The plug-in {point.value if point else ''} cannot be loaded, so there is no command {name}: {broken}"
+        notice = f"The plug-in {point.value} cannot be loaded, so there is no command {name}: {broken}"
         print(neutral(notice), file=sys.stderr)
         return None
-
-
-@cache
-def _built(name: str, one: Any) -> Any:
-    """Return a function or a group as a command of Typer, with its options."""
     frame = typer.Typer(rich_markup_mode=None)
-    if isinstance(one, typer.Typer):
-        frame.add_typer(one, name=name, cls=_Subcommands)
+    if isinstance(found, typer.Typer):
+        frame.add_typer(found, name=name, cls=_Subcommands)
     else:  # the angle of goto can be negative
-        frame.command(name, context_settings={"ignore_unknown_options": True} if name == "goto" else None)(one)
+        frame.command(name, context_settings={"ignore_unknown_options": True} if name == "goto" else None)(found)
     return typer.main.get_group(frame).commands[name]
 
 
+class _Table(Mapping[str, Any]):
+    """The commands by name. To import all of them takes a second, so each is imported when it is asked for."""
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_places())
+
+    def __len__(self) -> int:
+        return len(_places())
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in _places() or (found := _built(name)) is None:
+            raise KeyError(name)
+        return found
+
+
 def _sentence(name: str) -> str:
-    """Return the first sentence about a command, "" if it cannot be loaded; our own are read without an import."""
-    place = PLACES.get(name)
-    if place is None:
-        found = _plugin(name)
-        text = _built(name, found).help if found else ""
-    else:
-        module, _, function = place.partition(":")
-        tree = ast.parse(find_spec(f"{__package__}.{module}").loader.get_source(f"{__package__}.{module}"))  # type: ignore
-        text = ast.get_docstring(next((one for one in tree.body if getattr(one, "name", "") == function), tree))
-    return neutral(re.split(r"\.\s", text)[0].removesuffix(".")) + "." if text else ""
+    """Return the first sentence about a command: of its function, or of the module of a group. Nothing is imported."""
+    point = _places()[name]
+    spec = find_spec(point.module)
+    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else "")
+    functions = [one for one in tree.body if isinstance(one, ast.FunctionDef) and one.name == point.attr]
+    text = ast.get_docstring(functions[0] if functions else tree)
+    return neutral(re.split(r"\.\s", text or "")[0].removesuffix(".")) + "."
 
 
 class _Commands(TyperGroup):
@@ -153,7 +137,7 @@ class _Commands(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        self.commands = cast(Any, _Table(self.commands))
+        self.commands = cast(Any, _Table())
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         wants_json = "--json" in args
@@ -179,11 +163,9 @@ class _Commands(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the commands in their sections, and then the options; the help of Typer begins with the options."""
-        others = {"Plug-ins": [name for name in self.commands if name not in PLACES]}
-        sections = {
-            title: [(neutral(name), text) for name in names if (text := _sentence(name))]
-            for title, names in ({title: list(places) for title, places in SECTIONS.items()} | others).items()
-        }
+        named = {name for names in SECTIONS.values() for name in names}
+        groups = {**SECTIONS, "Plug-ins": [name for name in self.commands if name not in named]}
+        sections = {title: [(neutral(name), _sentence(name)) for name in names] for title, names in groups.items()}
         options: Any = self.get_params(ctx)
         sections["Options"] = [
             (f"{', '.join(sorted(one.opts))} {one.metavar or ''}".rstrip(), one.help) for one in options

@@ -356,24 +356,21 @@ def _one_of(answer: Identified) -> str:
     return joined(items, "or")
 
 
-def answer_lines(answer: Identified) -> list[str]:
+def answer_lines(answer: Identified) -> tuple[str, str]:
     """Return the result, and why the search ended."""
     reason = sentence(reason_words(answer))
-    if (
-        answer.outcome is Outcome.UNKNOWN
-        and answer.candidates[0].probability is not None
-        and answer.not_enrolled is None
-    ):
+    has_shares = answer.candidates[0].probability is not None and answer.not_enrolled is None
+    if answer.outcome is Outcome.UNKNOWN and has_shares:
         reason += " Percentages of candidates are shares among the enrolled objects."
     if answer.left_out:
         reason += f" The object changed, so {counted(len(answer.left_out), 'earlier view')} did not count."
-    return [result_words(answer), reason]
+    return result_words(answer), reason
 
 
 def answer_words(answer: Identified) -> str:
     """Return the answer in sentences: the result first, then why the search ended."""
-    result, *rest = answer_lines(answer)
-    return " ".join([f"{result.removesuffix('.')}.", *rest])
+    result, reason = answer_lines(answer)
+    return f"{result.removesuffix('.')}. {reason}"
 
 
 def _symmetry_words(similar: SimilarObjects) -> str:

@@ -110,7 +110,6 @@ def set_(
 
 
 def _checked(settings: Settings) -> tuple[Values, RigConfig, dict[str, BaseModel]]:
-
     values = read_values(settings.config, settings.overrides)
     return values, *check_config(values)
 
@@ -134,7 +133,6 @@ def _keys(config: RigConfig, options: Mapping[str, BaseModel]) -> Iterator[tuple
 
 
 def _unknown(wanted: str, names: list[str]) -> ConfigError:
-
     names += sorted({name.rpartition(".")[0] for name in names} - {""})
     near = get_close_matches(wanted, names, n=1)
     return ConfigError(

@@ -1,25 +1,26 @@
 """Change the settings, the id and the baud rate of the servo, and record a trace."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
+from rig.bench.changes import set_key
 from rig.cli.ui.command import Group
 from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption
 from rig.cli.ui.present import show_progress
-from rig.cli.ui.prompts import ask_yes_no, confirm
+from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
-from rig.config.toml_file import read_text, save, with_values
 from rig.config.values import default_path
 from rig.core.errors import ReplayMismatch
 from rig.core.next_steps import Do
 from rig.core.phrases import counted
 from rig.devices.dynamixel import settings as servo_settings
 from rig.devices.trace import read_trace
-from rig.doctor.examination import DoctorContext, open_context
+from rig.doctor.examination import open_context
 from rig.doctor.replay import replay_devices, replay_drivers
 from rig.doctor.servo_scan import SingleServo, single_servo
 from rig.jobs.trace import REACH_DEG
@@ -49,8 +50,8 @@ def settings_(
         if not settings.json:
             print(servo.found)
             print("\n".join(f"  {difference}" for difference in differences) or "  all as required")
-        written = bool(differences) and write and (yes or settings.json or ask_yes_no("Write these settings?"))
-        if written:
+        if written := bool(differences) and write:
+            confirm("Write these settings?", yes=yes, settings=settings)
             servo_settings.write(servo.bus, servo.found.bus_id, servo.table, differences)
     if settings.json:
         rows = [{"register": d.register, "found": d.found, "wanted": d.wanted, "reason": d.reason} for d in differences]
@@ -106,11 +107,10 @@ def record(
         confirm(f"The table rotates by up to {REACH_DEG:.0f}° and back.", yes=yes, settings=settings)
     with settings.open_parts() as context:
         port = context.computer.serial_port(context.config.servo.port)
-    adapter = {key: port.usb.get(key) for key in ("idVendor", "idProduct")} if port else {}
+    adapter: dict[str, Any] = {key: port.usb.get(key) for key in ("idVendor", "idProduct")} if port else {}
+    adapter["latency_ms"] = port.latency_ms if port else None
     desk = CommandDesk(settings.tracing(file))
-    desk.run(
-        "record", record_job(desk, still=still, adapter={**adapter, "latency_ms": port.latency_ms if port else None})
-    )
+    desk.run("record", record_job(desk, still=still, adapter=adapter))
 
 
 @app.command("replay")
@@ -147,48 +147,25 @@ def replay_(
 
 
 def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
-
+    """Change id or baud rate of the servo, and in the configuration file if that has the old value."""
     show_progress("searching for the servo ...")
     with settings.open_parts() as context, single_servo(context) as servo:
         show_progress("")
         old = servo.found.bus_id if what == "id" else servo.found.baud
-        if not settings.json:
-            print(servo.found)
         if old != new:
-            if not (yes or settings.json or ask_yes_no(f"Change {what} from {old} to {new}, with the torque off?")):
-                print("Nothing was changed.")
-                return
-            if what == "id":
-                servo.set_id(new)
-            else:
-                servo.set_baud(new)
-    followed = _follow(settings, context, what, old, new)
-    if settings.json:
-        settings.print_json({**_identity(servo), what: new, "was": old, "config_changed": followed or None})
-        return
-    print(f"The servo has {what} {new} already." if old == new else f"Changed {what} to {new}, and verified it.")
-    if followed:
-        print(f"{followed}: servo.{what} = {new}")
-    elif getattr(context.config.servo, what) != new:
-        print(f"To use it: {context.step(Do.SET_KEY(key=f'servo.{what}', value=new)).command}")
-
-
-def _follow(settings: Settings, context: DoctorContext, what: str, old: int, new: int) -> str:
-    """Update the configuration file if it had the old value, and return its path; empty if it was not changed."""
-    path = settings.config or default_path()
-    configured = getattr(context.config.servo, what)
-    if path is None or not path.exists() or configured != old or configured == new:
-        return ""
-    save(path, with_values(read_text(path), {("servo", what): new}))
-    return str(path)
+            question = f"{servo.found}: change {what} from {old} to {new}, with the torque off?"
+            confirm(question, yes=yes, settings=settings)
+            change = servo.set_id if what == "id" else servo.set_baud
+            change(new)
+    text = f"The servo has {what} {new} already." if old == new else f"Changed {what} to {new}, and verified it."
+    configured, path, followed = getattr(context.config.servo, what), settings.config or default_path(), None
+    if path is not None and path.exists() and configured == old != new:
+        set_key(path, f"servo.{what}", str(new))
+        text, followed = f"{text}\n{path}: servo.{what} = {new}", str(path)
+    elif configured != new:
+        text += f"\nTo use it: {context.step(Do.SET_KEY(key=f'servo.{what}', value=new)).command}"
+    settings.say(text, {**_identity(servo), what: new, "was": old, "config_changed": followed})
 
 
 def _identity(servo: SingleServo) -> dict[str, Any]:
-    found = servo.found
-    return {
-        "model": found.model,
-        "model_number": found.model_number,
-        "firmware": found.firmware,
-        "id": found.bus_id,
-        "baud": found.baud,
-    }
+    return {key.removeprefix("bus_"): value for key, value in asdict(servo.found).items()}

@@ -1,6 +1,7 @@
 """Manage the enrolled objects."""
 
 import sys
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
@@ -21,7 +22,7 @@ from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, UsageError
 from rig.core.json_form import plain
-from rig.core.phrases import angle_words, counted
+from rig.core.phrases import counted
 from rig.views.description import segmentation_summary, segmentation_words
 
 # Decision: docs/decisions/0010.
@@ -38,9 +39,6 @@ def list_(
 ) -> None:
     """List the enrolled objects. Exit code 7 if the catalog is damaged.
 
-    Columns: name of the object, its label, its number of views (in brackets those of an unfinished enrollment), and the
-    time when its enrollment was complete.
-
     Example: rig catalog list --label kitchen --bench sim
     """
     with settings.open_catalog(read_only=True) as catalog:
@@ -50,17 +48,9 @@ def list_(
         elif not objects:
             print("No such objects." if deleted or label else "No objects yet. Enroll one: rig enroll NAME")
         else:
-            rows = [
-                (
-                    one.name,
-                    one.label,
-                    f"{one.views}"
-                    + (f" (+{one.unfinished_views} unfinished)" if one.unfinished_views is not None else ""),
-                    f"{one.enrolled_utc:%Y-%m-%d %H:%M}" if one.enrolled_utc else "not yet",
-                )
-                for one in objects
-            ]
-            print_table(("object", "label", "views", "enrolled (UTC)"), rows)
+            print_table(
+                ("name", "label", "views", "unfinished_views", "enrolled_utc"), [asdict(one) for one in objects]
+            )
         damage = catalog.damage()  # seconds for a large catalog, so the table is shown before
     if damage is not None:
         raise damage
@@ -70,7 +60,6 @@ def list_(
 def show(settings: Settings, name: NameArgument) -> None:
     """Show an object: its enrollments with their sessions, and the angles of its views. Exit code 7 if it is damaged.
 
-    Columns: index of the view, azimuth of the camera, table angle by the servo's encoder and by the IMU, and sharpness.
     With --json all settings of the devices and conditions of each session are shown, too.
 
     Example: rig catalog show mug-white --bench sim
@@ -123,7 +112,6 @@ def _as_json(details: ObjectDetails, described: Described) -> dict[str, Any]:
 
 
 def _print_object(details: ObjectDetails, described: Described) -> None:
-
     summary = details.summary
     print("  ".join(filter(None, (summary.name, summary.label))))
     if summary.note:
@@ -140,17 +128,12 @@ def _print_object(details: ObjectDetails, described: Described) -> None:
     if details.views:
         if words := segmentation_words(segmentation_summary(described.segmentation)):
             print(words)
+        names = ("index", "azimuth_deg", "encoder_deg", "imu_deg")
         rows = [
-            (
-                str(view.index),
-                f"{view.azimuth_deg:.2f}°",
-                *("–" if angle is None else angle_words(angle, 2) for angle in (view.encoder_deg, view.imu_deg)),
-                f"{view.evidence.get('sharpness', float('nan')):.1f}",
-            )
+            {**{name: getattr(view, name) for name in names}, "sharpness": view.evidence.get("sharpness")}
             for view in details.views
         ]
-        titles = ("view", "azimuth", "encoder", "IMU", "sharpness")
-        print_table(titles, rows, right=titles)
+        print_table((*names, "sharpness"), rows)
 
 
 @app.command("rename")

@@ -17,12 +17,9 @@ from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 from rig.core.json_form import plain
-from rig.core.phrases import angle_words, counted, short
+from rig.core.phrases import counted
 
 app = Group(__doc__)
-
-_LONGEST_DETAIL: Final = 60
-"""Letters of a detail of the log in a table; --json has all."""
 
 _WHEN: Final = "2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w."
 SinceOption = Annotated[str | None, typer.Option(metavar="WHEN", help=f"Only those since this time: {_WHEN}")]
@@ -41,33 +38,12 @@ class Filters(TypedDict):
 
 @app.command("list")
 def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
-    """List results, oldest first. Filters use the corrected values.
-
-    Columns: number of the result, time, operator, sample, answer (a star marks a corrected one), views, and bench.
+    """List results, oldest first. Filters use the corrected values, and so do the columns.
 
     Example: rig results list --sample S-0042 --since 7d --bench sim
     """
-    found = _find(settings, filters)
-    if settings.json:
-        for result in found:
-            settings.print_json(plain_row(result.as_row().model_dump()))
-        return
-    if not found:
-        print("No results match.")
-        return
-    rows = [
-        (
-            str(result.id),
-            f"{result.time_utc:%Y-%m-%d %H:%M:%S}",
-            result.operator,
-            result.current.sample or "–",
-            f"{_words(result.current)}{' *' if result.corrections else ''}",
-            str(len(result.azimuths_deg)),
-            result.provenance.bench,
-        )
-        for result in found
-    ]
-    print_table(("result", "time (UTC)", "operator", "sample", "answer", "views", "bench"), rows, right=("result",))
+    rows = [result.as_row().model_dump() for result in _find(settings, filters)]
+    _show_rows(settings, rows, ("result", "time_utc", "operator", "sample", "outcome", "object", "views", "bench"))
 
 
 @app.command("show")
@@ -137,45 +113,24 @@ def correct(
 def log(settings: Settings, since: SinceOption = None) -> None:
     """Show who did what with the catalog and the table, oldest first.
 
-    Columns: time, user, action, object, details.
-
     Example: rig log --since 7d --bench sim
     """
     begin = _time(since, "--since")
     with settings.open_catalog(read_only=True) as catalog:
-        entries = catalog.log(since=begin)
+        rows = [shown(entry) for entry in catalog.log(since=begin)]
+    _show_rows(settings, rows, ("time_utc", "user", "action", "object_name", "details"))
+
+
+def _show_rows(settings: Settings, rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
+    """Print some columns of the rows, or with ``--json`` each row on a line."""
     if settings.json:
-        for entry in entries:
-            settings.print_json(shown(entry) | {"time_utc": entry.time_utc.isoformat()})
-        return
-    if not entries:
-        print("No entries since then." if since else "No entries yet.")
-        return
-    rows = [
-        (
-            f"{entry.time_utc:%Y-%m-%d %H:%M:%S}",
-            entry.user,
-            entry.action,
-            entry.object_name or "",
-            ", ".join(filter(None, (_detail(key, value) for key, value in entry.details.items()))),
-        )
-        for entry in entries
-    ]
-    print_table(("time (UTC)", "user", "action", "object", "details"), rows)
-
-
-def _detail(key: str, value: Any) -> str:
-    """Return a detail of the log in words: "enrollment 3", "to 90.0°", "replace"; empty if there is nothing to say."""
-    name = key.removesuffix("_deg").removesuffix("_id").replace("_", " ")
-    if value is None or isinstance(value, bool):
-        return name if value else ""
-    if key.endswith("_deg") and isinstance(value, int | float):
-        return f"{name} {angle_words(value)}"
-    return f"{name} {short(', '.join(map(str, value)) if isinstance(value, list) else str(value), _LONGEST_DETAIL)}"
+        for row in rows:
+            settings.print_json(plain_row(row))
+    else:
+        print_table(columns, rows)
 
 
 def _find(settings: Settings, filters: Filters) -> list[Result]:
-
     wanted = ResultFilter(
         sample=filters["sample"],
         object_name=filters["name"],

@@ -105,7 +105,6 @@ def evaluate(
 
 
 def _dataset(settings: Settings, folder: Path | None, experiment: Experiment) -> Dataset:
-
     if folder is None:
         with settings.open_catalog(read_only=True) as catalog:
             dataset = load_catalog(catalog)

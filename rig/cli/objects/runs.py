@@ -92,7 +92,6 @@ def _motion(settings: Settings) -> str:
 
 
 def _check(settings: Settings, saved: SavedRun) -> None:
-
     with saved.damage():
         found = check_run(saved)
     done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."

@@ -2,9 +2,10 @@
 
 import os
 import sys
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
-from typing import Final, TypeVar
+from datetime import datetime
+from typing import Any, Final, TypeVar
 
 import typer
 from rich.cells import cell_len
@@ -17,6 +18,7 @@ from rig.catalog.jobs import JobProgress, finished
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
+from rig.core.phrases import number
 
 _T = TypeVar("_T")
 _PIPE_COLUMNS: Final = 240  # no row of a table is cut for a program that reads it
@@ -43,15 +45,33 @@ def console(*, stderr: bool = False, plain: bool = False) -> Console:
     return screen
 
 
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
-    """Print a table: every row in full, as one line."""
-    lines = [[neutral(cell) for cell in row] for row in (columns, *rows)]
+def print_table(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print these columns of the rows: every row in full, as one line; numbers end below each other."""
+    lines = [list(columns), *([neutral(_cell(row[name])) for name in columns] for row in rows)]
     widths = [max(map(cell_len, cells)) for cells in zip(*lines, strict=True)]
+    right = [all(isinstance(row[name], int | float | None) for row in rows) for name in columns]
     for line in lines:
         spaces = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
-        cells = zip(columns, line, spaces, strict=True)
-        print("  ".join(space + cell if name in right else cell + space for name, cell, space in cells).rstrip())
+        cells = zip(right, line, spaces, strict=True)
+        print("  ".join(space + cell if to_right else cell + space for to_right, cell, space in cells).rstrip())
     sys.stdout.flush()
+
+
+def _cell(value: Any) -> str:
+    """Return a value as the text of a cell."""
+    match value:
+        case None | "":
+            return "–"
+        case datetime():
+            return f"{value:%Y-%m-%d %H:%M:%S}"
+        case float():
+            return number(value, ".2f")
+        case dict():
+            return ", ".join(f"{key} {_cell(item)}" for key, item in value.items())
+        case list() | tuple():
+            return ", ".join(map(str, value))
+        case _:
+            return str(value)
 
 
 class ProgressBar(AbstractContextManager["ProgressBar"]):

@@ -92,22 +92,13 @@ def ask_line(question: str, *, otherwise: str = "add --yes") -> str:
     return answer
 
 
-def ask_yes_no(question: str) -> bool:
-    """Ask for yes or no; Enter means no."""
-    while True:
-        answer = ask_line(f"{question} [y/N]").lower()
-        if answer in ("", "y", "yes", "n", "no"):
-            return answer.startswith("y")
-        print("Answer y or n.", file=sys.stderr)
-
-
 def is_interactive() -> bool:
     """Return whether an operator can answer questions: standard input is a terminal."""
     return sys.stdin.isatty()
 
 
 def confirm(question: str, *, yes: bool, settings: Settings) -> None:
-    """Ask before a deletion.
+    """Ask for yes or no before a deletion or another change; Enter means no.
 
     Raises `UsageError`: there is no terminal to ask on, and ``yes`` is not set.
     """
@@ -115,6 +106,8 @@ def confirm(question: str, *, yes: bool, settings: Settings) -> None:
         return
     if settings.json or not is_interactive():
         raise UsageError(f"{question} This needs a confirmation.", next_step="Add --yes to confirm.")
-    if not ask_yes_no(question):
+    while (answer := ask_line(f"{question} [y/N]").lower()) not in ("", "y", "yes", "n", "no"):
+        print("Answer y or n.", file=sys.stderr)
+    if not answer.startswith("y"):
         print("Nothing was changed.", file=sys.stderr)
         raise typer.Exit(EXIT_DECLINED)

@@ -73,7 +73,6 @@ def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, w
 
 
 PLAIN = """
-@app.command("new")
 def new():
     try:
         interrupt()
@@ -81,7 +80,6 @@ def new():
         print("closed")
 """
 DEL = """
-@app.command("new")
 @command
 def new(settings):
     class Part:
@@ -101,13 +99,15 @@ def new(settings):
 def test_ctrl_c_unwinds_each_command(command, output, errors):
     code = f"""
 import os, signal, sys, threading
-from rig.cli.main import app
+from importlib.metadata import EntryPoint
+from rig.cli.main import _places
 from rig.cli.start import main
 from rig.cli.ui.command import command
 
 def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
 {command}
+_places()["new"] = EntryPoint("new", "__main__:new", "rig.commands")
 sys.argv = ["rig", "new"]
 main()
 """

@@ -161,14 +161,15 @@ def test_find_on_an_empty_computer_reports_no_device(parts, home):
 def test_servo_changes_update_the_file(parts, home):
     (home / "rig.toml").write_text("[servo]\nid = 1 # sticker\n", encoding="utf-8")
     assert "verified" in rig("servo", "set-id", "4", "--yes").stdout
-    assert rig("servo", "set-baud", "1000000", answers="y\n").exit_code == 0
+    assert rig("servo", "set-baud", "1000000", "--yes").exit_code == 0
     assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo]\nid = 4 # sticker\nbaud = 1000000\n"
     assert "already" in rig("servo", "set-id", "4", "--yes").stdout
 
 
-def test_missing_or_negative_answer_changes_nothing(parts, home):
+def test_missing_or_negative_answer_changes_nothing(parts, home, monkeypatch):
     assert rig("servo", "set-id", "4").exit_code == 2
-    assert "Nothing was changed." in rig("servo", "set-id", "4", answers="n\n").stdout
+    monkeypatch.setattr("rig.cli.ui.prompts.is_interactive", lambda: True)
+    assert "Nothing was changed." in rig("servo", "set-id", "4", answers="what\nn\n").stderr
     assert parts.devices.servo.memory["ID"] == 1
     assert rig("servo", "set-id", "300", "--yes").exit_code == 2
 

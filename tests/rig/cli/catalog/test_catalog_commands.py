@@ -43,7 +43,7 @@ def test_what_is_deleted_is_confirmed_and_can_be_collected(two: Rig) -> None:
     assert two("catalog", "undelete", "tin").exit_code == 7
     assert "nothing to remove" in two("catalog", "gc").stdout
     assert two("log", "--since", "1h").stdout.count("deleted") == 1
-    assert "No entries since then" in two("log", "--since", "2999-01-01").stdout
+    assert two("log", "--since", "2999-01-01").stdout.splitlines() == ["time_utc  user  action  object_name  details"]
     assert two("log", "--since", "yesterdayish").exit_code == 2
 
 
