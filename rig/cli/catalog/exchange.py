@@ -132,23 +132,20 @@ def _source(
 ) -> Iterator[TransferSource]:
     """Yield what is imported: a bundle, a catalog such as a training set, or photographs."""
     clock = SystemClock()
-    is_named = pattern is not None or table_angles
     is_folder = source.is_dir() and not (source / DATABASE_NAME).exists()
-    if is_named and not is_folder:
+    has_photographs = is_folder or (source.suffix.lower() == ".csv" and source.is_file())
+    is_named = pattern is not None or table_angles
+    if source.exists() and ((is_named and not is_folder) or (empty_table is not None and not has_photographs)):
         raise UsageError(
             f"{source} is not a folder of photographs.",
-            next_step="Use --pattern and --table-angles only with a folder of photographs.",
+            next_step="Use --pattern and --table-angles only with a folder of photographs, and --empty-table with that "
+            "or with a table (.csv).",
         )
-    if is_folder or (source.suffix.lower() == ".csv" and source.is_file()):
+    if has_photographs:
         photographs = read_photographs(source, pattern=pattern, table_angles=table_angles, now=clock.utc())
         if empty_table is not None:
             photographs.use_empty_tables(empty_table, table_angles=table_angles)
         yield photographs
-    elif empty_table is not None and source.exists():
-        raise UsageError(
-            f"{source} contains no photographs, but objects with their own empty-table images.",
-            next_step="Use --empty-table only with photographs: a folder, or a table (.csv).",
-        )
     elif source.is_dir():
         with Catalog.open(source, clock=clock, create=False, read_only=True) as catalog:
             yield CatalogSource(catalog, own=False)

@@ -59,17 +59,18 @@ def test_status_shows_the_other_devices_if_one_is_missing(rig, device):
 
 
 def test_snapshot_is_written_once(rig):
-    done = rig("snapshot", "table.png", "--json")
-    assert json.loads(done.stdout)["locks"]["gain"] == 0
-    image = cv2.imread("table.png")
-    assert image.shape == (240, 320, 3)
-    assert rig("snapshot", "table.png").exit_code == 2
-    assert rig("snapshot", "table.jpg").exit_code == 2
+    assert json.loads(rig("snapshot", "table.png", "--json").stdout)["locks"]["gain"] == 0
+    assert cv2.imread("table.png").shape == (240, 320, 3)
     assert "The focus is 120 now" in rig("snapshot", "sharp.png", "--refocus", "--set", "state_dir=state").output
     assert json.loads(Path("state/sim/camera-focus.json").read_text())["focus"] == 120
-    assert rig("snapshot", "other.png", "--refocus", "--set", "camera.focus=33").exit_code == 2
-    assert rig("snapshot", "nowhere/table.png").exit_code == 2
-    assert rig("snapshot", "other.png", "--set", 'bench.sim.faults=["camera.off"]').exit_code == 4
+    for words, code in (
+        (("table.png",), 2),
+        (("table.jpg",), 2),
+        (("nowhere/table.png",), 2),
+        (("other.png", "--refocus", "--set", "camera.focus=33"), 2),
+        (("other.png", "--set", 'bench.sim.faults=["camera.off"]'), 4),
+    ):
+        assert rig("snapshot", *words).exit_code == code, words
     assert not Path("other.png").exists()
 
 

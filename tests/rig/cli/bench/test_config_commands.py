@@ -10,7 +10,7 @@ from operator import attrgetter
 import pytest
 
 from rig.bench import bench_kind, bench_names, check_config
-from rig.calibrations import CalibrationStore, Estimate
+from rig.calibrations import CalibrationStore
 from rig.config import RigConfig, load_config
 from rig.config.values import read_values
 from rig.config.wording import blank_file, key_info
@@ -80,11 +80,8 @@ def test_show_prints_toml_with_the_source_of_each_value(rig, tmp_path):
     shown = tomllib.loads(done.stdout)
     assert (shown["servo"]["id"], shown["servo"]["baud"], shown["bench"]["sim"]["object"]) == (4, 115200, "dice")
     reported = json.loads(rig("config", "show", "servo", "--set", "servo.baud=115200", "--json").stdout)["keys"]
-    assert {key: reported[key]["origin"] for key in ("servo.id", "servo.baud", "servo.port")} == {
-        "servo.id": "rig.toml",
-        "servo.baud": "--set",
-        "servo.port": "default",
-    }
+    origins = [reported[key]["origin"] for key in ("servo.id", "servo.baud", "servo.port")]
+    assert origins == ["rig.toml", "--set", "default"]
     assert reported["servo.baud"]["unit"] == "bit/s"
     assert "table.zero_deg" not in reported
     assert "Did you mean servo.port?" in rig("config", "show", "servo.prot").stderr
@@ -92,34 +89,26 @@ def test_show_prints_toml_with_the_source_of_each_value(rig, tmp_path):
 
 def test_show_reports_calibrations_in_force(rig, tmp_path):
     """The gyro's scale of a calibration is in force; the file overrides that of the backlash, and --set the file."""
-    folder = tmp_path / "calibrations"
     (tmp_path / "rig.toml").write_text(
-        f'default_bench = "sim"\ncalibration_dir = "{folder}"\n[table]\nbacklash_deg = 0.3\n', encoding="utf-8"
+        'default_bench = "sim"\ncalibration_dir = "calibrations"\n[table]\nbacklash_deg = 0.3\n', encoding="utf-8"
     )
-
-    def store(name, settings, estimate, **other):
+    settings = {"imu.scale": 1.02, "table.backlash_deg": 0.2, "view.roi": [0, 0, 100, 100]}
+    days = {"view.roi": 1}  # this calibration is no longer valid
+    for key, value in settings.items():
         result = replace(
             RESULT,
-            name=name,
-            estimates={name.partition(".")[2]: estimate},
+            name=key,
             when_utc=SystemClock().utc() - timedelta(days=2),
             device={"bench": "sim", "imu": {"axis": "z", "sign": 1}},
-            settings=settings,
-            **other,
+            settings={key: value},
+            valid_days=days.get(key, 30),
         )
-        CalibrationStore(folder / "sim").add(result)
-        return result.id
-
-    scale = store("imu.scale", {"imu.scale": 1.02}, Estimate(1.02, (), ""))
-    store("servo.backlash", {"table.backlash_deg": 0.2}, Estimate(0.2, (), "°"))
-    store("table.axis", {"view.roi": [0, 0, 100, 100]}, Estimate(1.0, (), "mm"), valid_days=1)
-
+        CalibrationStore(tmp_path / "calibrations" / "sim").add(result)
     arguments = ("config", "show", "--set", "table.backlash_deg=0.4")
-    found = json.loads(rig(*arguments, "--json").stdout)
-    sources = {name: (key["origin"], key["value"]) for name, key in found["keys"].items()}
-    assert sources["imu.scale"] == (scale, 1.02)
-    assert sources["table.backlash_deg"] == ("--set", 0.4)
-    assert sources["view.roi"] == ("default", [80, 0, 480, 480])  # that calibration is no longer valid
+    keys = json.loads(rig(*arguments, "--json").stdout)["keys"]
+    assert [keys[key]["value"] for key in settings] == [1.02, 0.4, [80, 0, 480, 480]]
+    assert keys["imu.scale"]["origin"].startswith("imu.scale@")
+    assert [keys[key]["origin"] for key in ("table.backlash_deg", "view.roi")] == ["--set", "default"]
     assert tomllib.loads(rig(*arguments).stdout)["imu"]["scale"] == 1.02
 
 
@@ -130,6 +119,7 @@ OPTIONAL = [
     if key.allowed.endswith("or none")
 ]
 """All keys that can be none, with the prefix of their section."""
+assert {"camera.exposure_us", "view.roi", "bench.sim.object"} <= {f"{above}{info.name}" for above, info in OPTIONAL}
 
 
 @pytest.mark.parametrize(("above", "info"), OPTIONAL, ids=[f"{above}{info.name}" for above, info in OPTIONAL])

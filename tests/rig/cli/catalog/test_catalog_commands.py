@@ -1,8 +1,6 @@
 """The commands of the catalog as a technician calls them."""
 
 import json
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,11 +10,7 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from rig.catalog import Catalog
-from rig.catalog.jobs import finished
-from rig.catalog.verify import verify
 from rig.cli.main import app
-from rig.core.clock import SystemClock
 from tests.rig.cli.noise_photographs import photographs
 
 Rig = Callable[..., Result]
@@ -126,38 +120,3 @@ def test_photographs_are_imported_with_empty_table_images(rig: Rig, tmp_path: Pa
     (session,) = shown["enrollments"][0]["sessions"]
     stored = Path("catalog", "images", session["empty_table"][:2], session["empty_table"])
     assert stored.read_bytes() == Path("tables/table__0.png").read_bytes()
-
-
-INTERRUPTED = """
-import os, signal
-from contextlib import closing
-from rig.catalog import incoming, jobs
-from rig.cli.main import main
-
-jobs.PORTION = 8  # so that few photographs are enough for two processes
-staged = incoming.map_in_processes
-
-def interrupted(*arguments):
-    with closing(staged(*arguments)) as portions:  # a loop closes it, too; a variable of the traceback would not
-        yield next(portions)
-        os.killpg(os.getpgrp(), signal.SIGINT)  # as in a terminal, to all processes of the program
-        yield from portions
-
-incoming.map_in_processes = interrupted
-main()
-"""
-
-
-@pytest.mark.nightly
-def test_interrupted_import_leaves_images_only(tmp_path: Path) -> None:
-    photographs(tmp_path / "in", "jar", step_deg=5)
-    (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
-    words = [sys.executable, "-c", INTERRUPTED, "import", "in", "--jobs", "2"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, start_new_session=True, timeout=60)
-    assert done.returncode == 130, done.stderr
-    assert "nothing was imported" in done.stderr
-    assert "Traceback" not in done.stderr
-    with Catalog.open(tmp_path / "catalog", clock=SystemClock()) as catalog:
-        assert (catalog.objects(), catalog.log()) == ([], [])
-        assert not list(catalog.path.rglob("*.part"))
-        assert finished(verify(catalog)).findings == ()

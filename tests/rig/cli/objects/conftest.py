@@ -24,17 +24,9 @@ def original(tmp_path_factory):
             "lamp": ["enroll", "lamp", "--label", "kitchen", "--label", "brass"],
             "dice": ["enroll", "dice", "--json"],
             "run": [
-                "identify",
-                "--strategy",
-                "ahbr",
-                "--set",
-                "bench.sim.object=dice",
-                "--set",
-                "identify.min_score=0.9",  # six views and two objects give a limit that none of them reaches
-                "--seed",
-                "4",
-                "--save-run",
-                "runs/1",
+                *("identify", "--strategy", "ahbr", "--set", "bench.sim.object=dice", "--seed", "4"),
+                # six views and two objects give a limit that none of them reaches
+                *("--set", "identify.min_score=0.9", "--save-run", "runs/1"),
             ],
         }.items():
             done = CliRunner().invoke(app, words)
