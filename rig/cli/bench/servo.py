@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from rig.bench.changes import set_key
+from rig.bench.bench import set_key
 from rig.cli.ui.command import Group
 from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.exit_codes import EXIT_DEVICE
