@@ -63,13 +63,6 @@ class _Model(NamedTuple):
         return place
 
 
-class Searched(NamedTuple):
-    """The runs of an object, and the mean time to read, segment and describe one of its photographs."""
-
-    runs: Runs
-    describe_ns: float
-
-
 class LocalPhotographs:
     """The photographs of a data set, cut out when a search asks for them (`hbr.dense.session`).
 
@@ -472,36 +465,30 @@ def all_views(experiment: Experiment, dataset: Dataset, enrolled: list[LevelArra
     return Views.concatenate([Views.of_object(item.name, own, item.azimuth_deg, kind) for item, own in objects])
 
 
-def _search(experiment: Experiment, dataset: Dataset, views: Views, now_ns: Callable[[], int], j: int) -> Searched:
+def _search(experiment: Experiment, dataset: Dataset, views: Views, now_ns: Callable[[], int], j: int) -> Runs:
     condition, protocol = experiment.condition, experiment.protocol
-    began_ns = now_ns()
-    queries = levels_of(dataset, j, condition, protocol.seed)
-    describe_ns = (now_ns() - began_ns) / len(queries)
     photographs = LocalPhotographs(dataset, condition, protocol.seed)
-    runs = run_object(
+    return run_object(
         j,
-        queries,
+        levels_of(dataset, j, condition, protocol.seed),
         views,
         experiment.methods,
         protocol,
         photographs=photographs if photographs.possible else None,
         now_ns=now_ns,
     )
-    return Searched(runs, describe_ns)
 
 
-def _results(experiment: Experiment, dataset: Dataset, _model: object, found: list[Searched]) -> dict[str, Any]:
-    runs, report = Runs.concatenate([one.runs for one in found]), experiment.report
+def _results(experiment: Experiment, dataset: Dataset, _model: object, found: list[Runs]) -> dict[str, Any]:
+    runs, report = Runs.concatenate(found), experiment.report
     if report is not None:
         runs = runs.of(slice(report[0] - 1, report[1]))
     rng = generator(experiment.protocol.seed, dataset.name, "bootstrap", 0)
-    results = results_of(runs, experiment.methods, experiment.margin, experiment.min_views, rng)
-    results["wall_clock"]["describe_median_ms"] = float(np.median([one.describe_ns for one in found])) * 1e-6
     return {
         "settings": experiment.settings(dataset),
         "reported": None if report is None else list(report),
         "bytes_per_view": descriptor(experiment.condition.descriptor).size_bytes,
-        **results,
+        **results_of(runs, experiment.methods, experiment.margin, experiment.min_views, rng),
     }
 
 

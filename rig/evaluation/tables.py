@@ -158,14 +158,6 @@ def _probabilities(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
     return Rows(heads.split("|"), rows)
 
 
-def cost_sentence(results: Mapping[str, Any]) -> str | None:
-    """Return what a view costs, in words; None if the experiment did not measure it."""
-    if "bytes_per_view" not in results:
-        return None
-    took_ms = results["wall_clock"]["describe_median_ms"]
-    return f"A view has {results['bytes_per_view']} bytes; to describe one takes {took_ms:.1f} ms."
-
-
 def contest_sentences(results: Mapping[str, Any]) -> list[str]:
     """Return each comparison of two methods in words, with its interval and p-value."""
     labels = {method["name"]: method["label"] for method in results.get("methods", ())}

@@ -19,7 +19,7 @@ from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 from rig.evaluation.experiments import DEFAULT, load_catalog, load_experiment
 from rig.evaluation.run import own_folder, run_experiment, write_results
-from rig.evaluation.tables import contest_sentences, cost_sentence, tables
+from rig.evaluation.tables import contest_sentences, tables
 
 
 @command
@@ -99,7 +99,7 @@ def evaluate(
     for table in tables(results):
         screen.print(table.terminal())
         screen.print()
-    for sentence in filter(None, (cost_sentence(results), *contest_sentences(results))):
+    for sentence in contest_sentences(results):
         screen.print(sentence, markup=False, highlight=False, soft_wrap=not screen.is_terminal)
     print(f"Written: {folder}/results.json, results.csv, and the figures if there are any.", file=sys.stderr)
 

@@ -1,13 +1,19 @@
+"""The trials of an experiment: each equals its literal protocol."""
+
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import hbr
-from hbr import ViewIndex, Views
-from hbr.evaluation.protocol import METHODS, OUTCOMES, Method, Protocol, Removal, Runs, choose_methods
+from hbr import DenseIndex, Outcome, ViewIndex, Views, next_best_view
+from hbr.dense.stopping import decide
+from hbr.evaluation.protocol import METHODS, OUTCOMES, Method, Protocol, Runs, choose_methods
+from hbr.evaluation.results import contests, method_results
 from hbr.evaluation.trials import _Trials, run_object
 from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
+from tests.hbr.dense.searches import belief_after
 
 STEP = 15
 ALL = choose_methods(["all"])
@@ -41,98 +47,157 @@ def run(j: int, methods: tuple[Method, ...] = ALL, protocol: Protocol = PROTOCOL
     return run_object(j, QUERIES[VIEWS.of(j)], VIEWS, methods, protocol)
 
 
+# -- each expected number comes from the functions of hbr on a model without the removed views --
+
+
+RING = np.arange(24)
+J, OWN = 2, VIEWS.of(2)
+
+
+def away_deg(angle_deg: float) -> float:
+    return float(abs((angle_deg + 180) % 360 - 180))
+
+
+def always(protocol: Protocol) -> np.ndarray:
+    """Return which of an object's views are enrolled in all trials."""
+    return RING % 3 == 0 if protocol.enrolled else RING >= 0
+
+
+def kept(protocol: Protocol, seen: list[int]) -> np.ndarray:
+    """Return which of the searched object's views stay enrolled after some queries."""
+    gone = {
+        "near": [i for i in RING if min(away_deg((i - s) * STEP) for s in seen) < protocol.near_deg],
+        "paper79": [i for s in seen for i in (s, (s + 1) % 24)],
+        "queries": seen,
+    }[protocol.removal]
+    return always(protocol) & ~np.isin(RING, gone)
+
+
+def model_of(keep: np.ndarray, protocol: Protocol) -> Views:
+    mask = np.tile(always(protocol), 6)
+    mask[OWN] = keep
+    return VIEWS.select(mask)
+
+
+Expected = tuple[dict[str, Any], float | None]
+"""The recorded values by name, and the planned rotation."""
+
+
+def by_paper(method: Method, protocol: Protocol, seen: list[int], measured_deg: np.ndarray, coin: bool) -> Expected:
+    index = ViewIndex(model_of(kept(protocol, seen), protocol))
+    settings = {"omega": method.omega, "list_length": method.list_length, "extension": method.extension}
+    queries = QUERIES[OWN[seen]]
+    ranking = hbr.retrieve(queries, measured_deg, index, **settings)  # type: ignore[arg-type]
+    found: dict[str, Any] = {"rank": 0, "margin": pytest.approx(hbr.score_margin(ranking, queries) / len(seen))}
+    if J in ranking.object_index:
+        place = ranking.object_index.tolist().index(J)
+        found |= {"rank": place + 1, "pose_error_deg": away_deg(ranking.pose_deg[place] - seen[-1] * STEP)}
+    if method.active and len(seen) > 1:
+        side = None if method.name != "coin" else "left" if coin else "right"
+        return found, hbr.next_view(ranking, side=side).rotation_deg  # type: ignore[arg-type]
+    return found, 90.0 if method.name in ("sweep-90", "ahbr-90") else None
+
+
+def by_hmm(method: Method, protocol: Protocol, seen: list[int], measured_deg: np.ndarray, _coin: bool) -> Expected:
+    model = model_of(kept(protocol, seen), protocol)
+    belief: PoseModel | PoseBelief = PoseModel(model)
+    for query, deg in zip(hbr.tanimoto(QUERIES[OWN[seen]], model.descriptors), measured_deg.tolist(), strict=True):
+        belief = update_poses(query, deg, belief)
+    assert isinstance(belief, PoseBelief)
+    objects, log_probability, pose_deg = belief.ranking()
+    probability, place = np.exp(log_probability), objects.tolist().index(J)
+    outcome = Outcome.FOUND if probability[0] >= CONFIDENT else Outcome.CONTINUE
+    found = {
+        "rank": place + 1,
+        "pose_error_deg": away_deg(pose_deg[place] - seen[-1] * STEP),
+        "score": pytest.approx(probability[0]),
+        "margin": pytest.approx(probability[0] - probability[1]),
+        "outcome": OUTCOMES.index(outcome),
+    }
+    return found, belief.next_view().rotation_deg if method.name == "hmm" else None
+
+
+def by_dense(method: Method, protocol: Protocol, seen: list[int], measured_deg: np.ndarray, coin: bool) -> Expected:
+    mask, keep = np.tile(always(protocol), 6), kept(protocol, seen)
+    gone = np.searchsorted(np.flatnonzero(mask), OWN[always(protocol) & ~keep])
+    index = DenseIndex(VIEWS.select(mask), omega=method.omega).without(gone)
+    belief = belief_after(QUERIES[OWN[seen]], measured_deg, index)
+    ranking, decision = belief.ranking(), decide(belief, last=len(seen) == protocol.max_views)
+    place = ranking.object_index.tolist().index(J)
+    found = {"rank": place + 1, "score": ranking.scores[0], "outcome": OUTCOMES.index(decision.outcome)}
+    best_deg = next_best_view(belief, not_enrolled=decision.not_enrolled).rotation_deg
+    planned = {"dense": best_deg, "dense-coin": abs(best_deg) * (1 if coin else -1), "dense-90": 90.0}
+    return found, planned.get(method.name)
+
+
+FEW = Protocol(trials=3, max_views=4, enrolled=8, removal="queries")
+DRIFT = replace(PROTOCOL, drift_deg=1.0)
+
+
 @pytest.mark.parametrize(
-    ("name", "removal"),
+    ("name", "protocol"),
     [
-        *((name, "near") for name in ("hbr", "hbr-visual", "hbr-0-orient", "ahbr", "ahbr-90", "coin", "sweep-90")),
-        ("hbr", "paper79"),
-        ("ahbr", "queries"),
+        *((name, DRIFT) for name in ("hbr", "hbr-visual", "hbr-0-orient", "ahbr", "ahbr-90", "coin", "sweep-90")),
+        *((name, replace(DRIFT, removal=removal)) for name, removal in (("hbr", "paper79"), ("ahbr", "queries"))),
+        *((name, DRIFT) for name in ("hmm", "hmm-random")),
+        *((name, FEW) for name in ("dense", "dense-90", "dense-random", "dense-coin")),
+        ("dense", Protocol(trials=2, max_views=4, near_deg=20)),
     ],
 )
-def test_trial_equals_the_literal_protocol(name: str, removal: Removal) -> None:
-    """Each expected number comes from `retrieve`, `lead` and `next_view` on a model without the removed views."""
-    method, protocol = METHODS[name], replace(PROTOCOL, removal=removal, drift_deg=1.0)
-    j = 2
-    own = VIEWS.of(j)
-    runs = run(j, (method,), protocol)
-    trials = trials_of(j, protocol)
+def test_trial_equals_the_literal_protocol(name: str, protocol: Protocol) -> None:
+    method = METHODS[name]
+    expected_of = by_dense if method.dense else by_hmm if method.hmm else by_paper
+    runs, trials = run(J, (method,), protocol), trials_of(J, protocol)
     for t in range(protocol.trials):
         draws = trials.draw(t)
-        seen, travelled = [int(draws.order[0])], 0.0
+        seen, travelled_deg = [int(draws.order[0])], 0.0
         for n in range(protocol.max_views):
-            angles = np.array(seen) * STEP
-            gone = {
-                "near": [i for i in range(24) if min(abs((i * STEP - a + 180) % 360 - 180) for a in angles) < 20],
-                "paper79": [i for s in seen for i in (s, (s + 1) % 24)],
-                "queries": seen,
-            }[removal]
-            model = VIEWS.select(np.setdiff1d(np.arange(len(VIEWS)), own[gone]))
-            ranking = hbr.retrieve(
-                QUERIES[own[seen]],
-                angles + draws.error_deg[: n + 1],
-                ViewIndex(model),
-                omega=method.omega,
-                list_length=method.list_length,
-                extension=method.extension,
-            )
-            place = ranking.object_index.tolist().index(j) if j in ranking.object_index else -1
-            assert runs.rank[0, 0, t, n] == place + 1
-            assert runs.margin[0, 0, t, n] == pytest.approx(hbr.score_margin(ranking, QUERIES[own[seen]]) / (n + 1))
-            assert runs.travelled_deg[0, 0, t, n] == travelled
-            if place >= 0:
-                error = abs((ranking.pose_deg[place] - angles[-1] + 180) % 360 - 180)
-                assert runs.pose_error_deg[0, 0, t, n] == error
-                assert runs.alike_error_deg[0, 0, t, n] <= error
-            if name in ("ahbr", "ahbr-90", "coin") and n > 0:
-                side = None if name != "coin" else ("left" if draws.coins[n + 1 :][:1].any() else "right")
-                wanted = angles[-1] + hbr.next_view(ranking, side=side).rotation_deg  # type: ignore[arg-type]
-            elif name in ("sweep-90", "ahbr-90"):
-                wanted = angles[-1] + 90
-            else:
-                wanted = draws.order[(n + 1) % protocol.max_views] * STEP
-            left = [i for i in range(24) if i not in seen]
-            following = min(left, key=lambda i: abs((i * STEP - wanted + 180) % 360 - 180)) if n < 4 else seen[0]
-            travelled += abs((following * STEP - angles[-1] + 180) % 360 - 180)
-            seen.append(following)
+            measured_deg = np.array(seen) * STEP + draws.error_deg[: n + 1]
+            following = (n + 1) % protocol.max_views
+            expected, planned_deg = expected_of(method, protocol, seen, measured_deg, bool(draws.coins[following]))
+            for key, value in (expected | {"travelled_deg": travelled_deg}).items():
+                assert getattr(runs, key)[0, 0, t, n] == value, (key, t, n)
+            wanted_deg = draws.order[following] * STEP if planned_deg is None else seen[-1] * STEP + planned_deg
+            left = [i for i in RING if i not in seen and not (protocol.enrolled and always(protocol)[i])]
+            seen.append(min(left, key=lambda i: away_deg(i * STEP - wanted_deg)))
+            travelled_deg += away_deg((seen[-1] - seen[-2]) * STEP)
+    assert not (runs.alike_error_deg > runs.pose_error_deg).any()
 
 
-@pytest.mark.parametrize("name", ["hmm", "hmm-random"])
-def test_trial_of_the_hidden_markov_model_equals_the_literal_protocol(name: str) -> None:
-    """Each expected number comes from `update_poses` and `next_view` on a model without the removed views."""
-    j, protocol = 2, replace(PROTOCOL, drift_deg=1.0)
-    own = VIEWS.of(j)
-    runs = run(j, (METHODS[name],), protocol)
-    trials = trials_of(j, protocol)
-    for t in range(protocol.trials):
-        draws = trials.draw(t)
-        seen, travelled = [int(draws.order[0])], 0.0
-        for n in range(protocol.max_views):
-            angles = np.array(seen) * STEP
-            gone = [i for i in range(24) if min(abs((i * STEP - a + 180) % 360 - 180) for a in angles) < 20]
-            model = VIEWS.select(np.setdiff1d(np.arange(len(VIEWS)), own[gone]))
-            similar = hbr.tanimoto(QUERIES[own[seen]], model.descriptors)
-            belief: PoseModel | PoseBelief = PoseModel(model)
-            for query, measured in zip(similar, (angles + draws.error_deg[: n + 1]).tolist(), strict=True):
-                belief = update_poses(query, measured, belief)
-            assert isinstance(belief, PoseBelief)
-            objects, log_probability, pose_deg = belief.ranking()
-            probability = np.exp(log_probability)
-            place = objects.tolist().index(j)
-            assert runs.rank[0, 0, t, n] == place + 1
-            assert runs.pose_error_deg[0, 0, t, n] == abs((pose_deg[place] - angles[-1] + 180) % 360 - 180)
-            assert runs.score[0, 0, t, n] == pytest.approx(probability[0])
-            assert runs.margin[0, 0, t, n] == pytest.approx(probability[0] - probability[1])
-            assert runs.outcome[0, 0, t, n] == OUTCOMES.index(
-                hbr.Outcome.FOUND if probability[0] >= CONFIDENT else hbr.Outcome.CONTINUE
-            )
-            assert runs.travelled_deg[0, 0, t, n] == travelled
-            wanted = draws.order[(n + 1) % protocol.max_views] * STEP
-            if name == "hmm":
-                wanted = angles[-1] + belief.next_view().rotation_deg
-            left = [i for i in range(24) if i not in seen]
-            following = min(left, key=lambda i: abs((i * STEP - wanted + 180) % 360 - 180))
-            travelled += abs((following * STEP - angles[-1] + 180) % 360 - 180)
-            seen.append(following)
+def test_queries_are_views_that_are_not_enrolled() -> None:
+    trials = trials_of(1, FEW)
+    for t in range(20):
+        assert (trials.draw(t).order % 3 != 0).all()
+    following = [trials._next(trials.draw(0), [1], rotation, 4) for rotation in np.arange(0, 360, 7.0)]
+    assert (np.array(following) % 3 != 0).all()
+    with pytest.raises(ValueError, match="16 views; for 16 queries"):
+        run(1, (METHODS["dense-90"],), replace(FEW, max_views=16))
+
+
+def test_oracle_has_a_larger_margin_than_a_fixed_step() -> None:
+    oracle, fixed = (
+        np.mean([run(j, (METHODS[name],), FEW).margin[0, 0, :, 1].mean() for j in range(6)])
+        for name in ("dense-oracle", "dense-90")
+    )
+    assert oracle > fixed
+
+
+def test_dense_searches_end_by_the_stopping_rule_and_methods_are_compared() -> None:
+    methods = choose_methods(["dense", "dense-90", "dense-mutual", "hbr"])
+    runs = Runs.concatenate([run(j, methods, FEW) for j in range(6)])
+    runs.named[0] = True
+    runs.outcome[0] = [OUTCOMES.index(Outcome.CONTINUE)] * 2 + [OUTCOMES.index(Outcome.FOUND)] * 2
+    runs.outcome[0, 0, :, 2:] = OUTCOMES.index(Outcome.UNKNOWN)
+    runs.outcome[0, 1, :, 2:] = OUTCOMES.index(Outcome.AMBIGUOUS)  # the right object leads, but was not found
+    stopping = method_results(runs, methods, margin=10.0)[0]["stopping"]
+    assert (stopping["views_mean"], stopping["ended_early"]) == (3, 1.0)
+    rates = [stopping[f"{name}_rate"] for name in ("hit", "unknown", "ambiguous", "wrong")]
+    assert rates == pytest.approx([4 / 6, 1 / 6, 1 / 6, 0])
+    runs.named[0, 2, 0, 2] = False  # the ranking does not count: the fit of the pixels may name another object
+    assert method_results(runs, methods, margin=10.0)[0]["stopping"]["wrong_rate"] == pytest.approx(1 / 18)
+    assert method_results(runs, methods, margin=10.0)[3]["stopping"]["views_mean"] == 4
+    asked = {(c["first"], c["first_views"], c["second"]) for c in contests(runs, methods, np.random.default_rng(0))}
+    assert {("dense", 3, "dense-90"), ("dense", 2, "dense-mutual")} <= asked
 
 
 def test_methods_have_the_same_trials_in_any_selection() -> None:
