@@ -1,7 +1,7 @@
 """Results of an experiment as tables of texts: each is made of the rows that ``results.csv`` has."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -10,19 +10,14 @@ from hbr.evaluation.results import Row
 from rig.core.phrases import percent, signed
 
 
-class Rows(NamedTuple):
-    """A table of texts: headings and rows; the first column contains names."""
-
-    columns: list[str]
-    rows: list[list[str]]
-
-    def terminal(self) -> Table:
-        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
-        for i, heading in enumerate(self.columns):
-            table.add_column(heading, justify="right" if i else "left", no_wrap=True)
-        for row in self.rows:
-            table.add_row(*row)
-        return table
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Return a table for a terminal; its first column contains names."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for i, heading in enumerate(columns):
+        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def rows_of(results: Mapping[str, Any]) -> list[Row]:
@@ -38,7 +33,7 @@ def rows_of(results: Mapping[str, Any]) -> list[Row]:
     ]
 
 
-def tables(results: Mapping[str, Any]) -> list[Rows]:
+def tables(results: Mapping[str, Any]) -> list[Table]:
     """Return the tables that the terminal shows."""
     rows = rows_of(results)
     if "methods" in results:
@@ -48,7 +43,7 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
     return [_changes(rows), _intervals(rows), _probabilities(by_change), _stated(by_change)]
 
 
-def _curves(results: Mapping[str, Any], rows: Sequence[Row]) -> Rows:
+def _curves(results: Mapping[str, Any], rows: Sequence[Row]) -> Table:
     """Return a line for each method, and a column for each number of views."""
     views = sorted({row["views"] for row in rows})
     lines = []
@@ -56,10 +51,10 @@ def _curves(results: Mapping[str, Any], rows: Sequence[Row]) -> Rows:
         own = {row["views"]: row for row in rows if row["method"] == method["name"]}
         rates = [_percent(own[n]["hit_rate"]) if n in own else "" for n in views]
         lines.append([method["label"], *rates, _percent(own[max(own)]["best10_rate"])])
-    return Rows(["hit rate, %, at N =", *map(str, views), "best 10"], lines)
+    return _table(["hit rate, %, at N =", *map(str, views), "best 10"], lines)
 
 
-def _decisions(results: Mapping[str, Any]) -> Rows:
+def _decisions(results: Mapping[str, Any]) -> Table:
     """Return the cost of a decision, and the error of the pose after all views, by method."""
     rows = []
     for method in results["methods"]:
@@ -79,10 +74,10 @@ def _decisions(results: Mapping[str, Any]) -> Rows:
             ]
         )
     heads = "decision|views|p95|hits %|ambiguous %|unknown %|wrong %|rotated°|pose°|RMSE°"
-    return Rows([*heads.split("|"), "similar°", "RMSE°", "asym.°", "ms"], rows)
+    return _table([*heads.split("|"), "similar°", "RMSE°", "asym.°", "ms"], rows)
 
 
-def _poses(results: Mapping[str, Any]) -> Rows:
+def _poses(results: Mapping[str, Any]) -> Table:
     """Return how the RMS error of the orientation after all views is distributed over the objects (Fig. 5)."""
     rows = []
     for method in results["methods"]:
@@ -90,27 +85,27 @@ def _poses(results: Mapping[str, Any]) -> Rows:
         cells = [f"{value:.1f}" for value in np.quantile(found, [0, 0.25, 0.5, 0.75, 1])] if found else ["–"] * 5
         rows.append([method["label"], str(len(found)), *cells])
     heads = "RMSE of the pose by object, °|objects|least|25 %|median|75 %|largest"
-    return Rows(heads.split("|"), rows)
+    return _table(heads.split("|"), rows)
 
 
-def _stated(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
+def _stated(rates: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return what right answers state about the pose, by the name of the row (`hbr.evaluation.poses.pose_rates`)."""
     heads = "pose of right answers|one, %|several, %|error°|towards a view°|within σ, %|within 2 σ, %|one, 30° off, %"
     scales = {"pose_one": 100, "pose_several": 100, "pose_error_median_deg": 1, "pose_toward_view_median_deg": 1}
     scales |= {"pose_within_1_sigma": 100, "pose_within_2_sigma": 100, "pose_far": 100}
-    return Rows(heads.split("|"), [[name, *_cells(own, scales)] for name, own in rates.items()])
+    return _table(heads.split("|"), [[name, *_cells(own, scales)] for name, own in rates.items()])
 
 
 def _cells(own: Mapping[str, Any], scales: Mapping[str, int]) -> list[str]:
     return ["–" if own[key] is None else f"{scale * own[key]:.1f}" for key, scale in scales.items()]
 
 
-def _changes(rows: Sequence[Row]) -> Rows:
+def _changes(rows: Sequence[Row]) -> Table:
     """Return the shares in percent: of all objects, and of those that are reported alone."""
     heads = "change, %|objects|ranking, N = 1 / 2 / 4|decided right|wrong|ambiguous|called unknown|leader verified"
     heads += "|unknown accepted|left out in turn: accepted"
     shares = ("decided_wrong", "ambiguous", "called_unknown", "verified")
-    return Rows(
+    return _table(
         heads.split("|"),
         [
             [
@@ -127,7 +122,7 @@ def _changes(rows: Sequence[Row]) -> Rows:
     )
 
 
-def _intervals(rows: Sequence[Row]) -> Rows:
+def _intervals(rows: Sequence[Row]) -> Table:
     """Return the shares of enrolled objects in percent, with their intervals."""
     names = {
         **{f"hit_rate_{n}": f"ranked first, N = {n}" for n in (1, 2, 4)},
@@ -142,20 +137,20 @@ def _intervals(rows: Sequence[Row]) -> Rows:
         low, high = (_percent(row[f"{share}_{end}"]) for end in ("low", "high"))
         return f"{_percent(row[share])} [{low}, {high}]"
 
-    return Rows(
+    return _table(
         ["% [95 % interval by objects]", *(f"{row['change']}: {row['objects']}" for row in rows)],
         [[name, *(cell(row, share) for row in rows)] for share, name in names.items()],
     )
 
 
-def _probabilities(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
+def _probabilities(rates: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return the stated probabilities beside the shares that they promise, in percent, by the name of the row."""
     heads = "stated probability, mean %|named objects|stated|right|not enrolled: enrolled|left out"
     keys = ("accepted_stated", "accepted_right", "enrolled_not_enrolled", "left_out_not_enrolled")
     rows = [
         [name, f"{own['accepted_searches']}", *_cells(own, dict.fromkeys(keys, 100))] for name, own in rates.items()
     ]
-    return Rows(heads.split("|"), rows)
+    return _table(heads.split("|"), rows)
 
 
 def contest_sentences(results: Mapping[str, Any]) -> list[str]:

@@ -3,9 +3,8 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("hbr", "rig", "sim", "calibration", "examples", "benchmarks", "tests", "docs", "firmware", ".github")
@@ -73,14 +72,6 @@ ALLOWED_NAMES = frozenset(
         "turning_share",  # a field of the events
     }
 )
-COMMENTS_AND_STRINGS = re.compile(r"""/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|`[^`]*`""", re.DOTALL)
-NAMES = {
-    **dict.fromkeys((".c", ".h"), re.compile(r"\b[A-Za-z_]\w*")),
-    ".js": re.compile(r"\b(?:const|let|var|function|class)\s+([A-Za-z_]\w*)"),
-    ".css": re.compile(r"[.#]([A-Za-z][\w-]*)"),
-    ".j2": re.compile(r"""\b(?:id|class)="([^"{]*)"""),
-}
-"""Expressions that find the names in files of other languages, by suffix."""
 EXCEPTIONS: dict[str, tuple[str, ...]] = {
     "docs/reference/glossary.md": RETIRED,  # it lists them
     "docs/reference/style.md": (r"anew", r"anyhow"),  # examples of what not to write
@@ -106,10 +97,9 @@ def retired_terms() -> list[str]:
     for path in files():
         name = path.relative_to(ROOT).as_posix()
         allowed = EXCEPTIONS.get(name, ())
-        content = path.read_text(encoding="utf-8")
-        if not any_of_them.search(words(content).lower()):
+        if not any_of_them.search(words_of(path)):
             continue
-        for number, line in enumerate(content.splitlines(), 1):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             text = words(line)
             found += [
                 f"{name}:{number}: {match[0]}"
@@ -119,20 +109,19 @@ def retired_terms() -> list[str]:
     return found
 
 
+@cache
+def words_of(path: Path) -> str:
+    """Return the words of a file in lower case, those of names apart."""
+    return words(path.read_text(encoding="utf-8")).lower()
+
+
 def words(line: str) -> str:
     """Return a line with the words of each name apart: ``minFamiliarity`` and ``min_familiarity`` alike."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", line).replace("_", " ")
 
 
-def named(content: str, suffix: str = ".py") -> Iterator[tuple[str, int]]:
-    """Yield each name that a file defines, with its line."""
-    if suffix in NAMES:
-        code = (
-            COMMENTS_AND_STRINGS.sub(lambda found: "\n" * found[0].count("\n"), content) if suffix != ".j2" else content
-        )
-        for number, line in enumerate(code.splitlines(), 1):
-            yield from ((name, number) for found in NAMES[suffix].findall(line) for name in found.split())
-        return
+def named(content: str) -> Iterator[tuple[str, int]]:
+    """Yield each name that a Python file defines, with its line."""
     for node in ast.walk(ast.parse(content)):
         match node:
             case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.arg(arg=name):
@@ -146,41 +135,13 @@ def test_no_name_has_a_retired_word():
     found = [
         f"{path.relative_to(ROOT)}:{line}: {name}"
         for path in files()
-        if path.suffix in {".py", *NAMES}
-        and any_of_them.search(words(content := path.read_text(encoding="utf-8")).lower())
-        for name, line in named(content, path.suffix)
+        if path.suffix == ".py" and any_of_them.search(words_of(path))
+        for name, line in named(path.read_text(encoding="utf-8"))
         if name not in ALLOWED_NAMES
         and not name.startswith("test_")
-        and RETIRED_NAMES & set(words(name).lower().replace("-", " ").split())
+        and RETIRED_NAMES & set(words(name).lower().split())
     ]
     assert not found, "\n".join([f"{len(found)} names with retired words:", *found])
-
-
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("The program goes on where it was.", "next_look"),
-        ("Nobody is told.", "turn_by_hand"),
-        ("The import was refused.", "Shot"),
-    ],
-)
-def test_retired_phrases_and_names_are_found(text, name):
-    assert any(re.search(rf"\b(?:{term})\b", text, re.IGNORECASE) for term in RETIRED)
-    assert RETIRED_NAMES & set(words(name).lower().split())
-    assert [found for found, _ in named(f"def {name}(): ...")] == [name]
-
-
-@pytest.mark.parametrize(
-    ("suffix", "content", "names"),
-    [
-        (".c", 'int next_look = 1; /* turn */ // told\nputs("turn it");', ["int", "next_look", "puts"]),
-        (".js", "const turnTable = `turn ${by}`;\nfunction told() {}", ["turnTable", "told"]),
-        (".css", ".look-at { color: #fff; }\n#turn:hover { margin: .5rem; }", ["look-at", "fff", "turn"]),
-        (".j2", '<p id="look" class="turn quiet">Turn</p>', ["look", "turn", "quiet"]),
-    ],
-)
-def test_names_are_found_in_files_of_other_languages(suffix, content, names):
-    assert [name for name, _ in named(content, suffix)] == names
 
 
 def test_no_retired_term_is_used():

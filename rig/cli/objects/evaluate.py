@@ -97,7 +97,7 @@ def evaluate(
         return
     screen = console()
     for table in tables(results):
-        screen.print(table.terminal())
+        screen.print(table)
         screen.print()
     for sentence in contest_sentences(results):
         screen.print(sentence, markup=False, highlight=False, soft_wrap=not screen.is_terminal)
