@@ -74,6 +74,7 @@ def with_values(text: str, changes: Mapping[Key, Any]) -> str:
             "The file is not TOML.", next_step="Fix the line in the reason.", evidence={"reason": str(error)}
         ) from error
     for key, value in changes.items():
+        # What the edited text must say, and nothing else.
         expected = deepcopy(before)
         here = expected
         for part in key[:-1]:
@@ -83,6 +84,7 @@ def with_values(text: str, changes: Mapping[Key, Any]) -> str:
         if key[-1] in here and _same(here[key[-1]], value):
             continue
         here[key[-1]] = value
+        # The edit does not understand all of TOML, so its result is read again.
         try:
             edited = _edited(text, key, value)
             after = tomllib.loads(edited)

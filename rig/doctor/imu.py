@@ -17,7 +17,7 @@ from rig.devices.bno055 import SLOW_BUS
 from rig.devices.head.head import RigHead, open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.i2c import NO_DEVICE, RESTART_CONTROLLER, STUCK, controller_hangs, unbind_command
-from rig.devices.imu import Imu, ImuSamples, open_imu
+from rig.devices.imu import Imu, open_imu
 from rig.doctor.examination import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, graded, of_error, warning
 from rig.safety.gyro_rotation import DRAIN_SAMPLES
@@ -166,33 +166,24 @@ def _at_rest(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
     if note := imu_kind(context.config.imu.model).note:
         yield fine("imu_note", "{note}", note=note)
     context.identities["imu"] = asdict(sensor.identity)
-    yield _rest(context, sensor, _samples(context, sensor))
+    yield _rest(context, sensor)
     yield _gravity(context, sensor)
 
 
-def _samples(context: DoctorContext, sensor: Imu) -> ImuSamples:
-    """Return ``SECONDS`` of samples, without older ones."""
+def _rest(context: DoctorContext, sensor: Imu) -> Finding:
+    """Take ``SECONDS`` of samples, without older ones, and return whether they are those of a sensor at rest."""
     sensor.read_samples()
-    taken = []
-    drain_s = min(DRAIN_S, DRAIN_SAMPLES / sensor.rate_hz)
+    taken, drain_s = [], min(DRAIN_S, DRAIN_SAMPLES / sensor.rate_hz)  # before the sensor's buffer is full
     for _ in range(round(SECONDS / drain_s)):
         context.computer.clock.sleep(drain_s)
         taken.append(sensor.read_samples())
-    return ImuSamples(
-        np.concatenate([part.time_ns for part in taken]),
-        np.concatenate([part.gyro_dps for part in taken]),
-        sum(part.lost for part in taken),
-    )
-
-
-def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Finding:
-    wanted = SECONDS * sensor.rate_hz
-    if len(samples.time_ns) < 0.8 * wanted:
+    rates, wanted = np.concatenate([part.gyro_dps for part in taken]), SECONDS * sensor.rate_hz
+    if len(rates) < 0.8 * wanted:
         text = "{samples} samples in {seconds:g} s instead of {wanted:.0f}, {lost} lost"
-        counts = {"samples": len(samples.time_ns), "seconds": SECONDS, "wanted": wanted, "lost": samples.lost}
+        lost = sum(part.lost for part in taken)
         fix = "Shorten the I2C cable and remove other devices from the bus"
-        return bad("samples_missing", text, fix, **counts)
-    axis, rates = "xyz".index(context.config.imu.axis), samples.gyro_dps
+        return bad("samples_missing", text, fix, samples=len(rates), seconds=SECONDS, wanted=wanted, lost=lost)
+    axis = "xyz".index(context.config.imu.axis)
     spread, bias = rates.std(axis=0), float(rates[:, axis].mean())
     expected = sensor.identity.gyro_noise_dps_rthz * np.sqrt(sensor.rate_hz / 2)
     evidence: dict[str, Any] = {"noise_dps": float(spread[axis]), "bias_dps": bias, "samples": len(rates)}

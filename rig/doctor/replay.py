@@ -5,7 +5,6 @@ recorded requests at their times, and their answers are compared with the record
 """
 
 from collections import Counter, deque
-from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from statistics import median
@@ -193,8 +192,8 @@ class _Servo:
             result.compare("servo answer", t_ns, recorded and recorded.data.hex(), reply and reply.data.hex())
             return
         result.compare("servo error", t_ns, (recorded.error, recorded.alert), (reply.error, reply.alert))
-        values = dict(self._values(request, reply))
-        for name, before in self._values(request, recorded):
+        values = self._values(request, reply)
+        for name, before in self._values(request, recorded).items():
             unknown = name.startswith(_ONLY_WRITTEN) and self._table[name].address not in self._written
             if not unknown and name not in _SWITCHING:
                 tolerance = self._tolerances.get(name, 0.0) if name in values else 0.0
@@ -202,19 +201,16 @@ class _Servo:
 
     def _first(self, requests: list[_Request]) -> dict[str, int]:
         answered = [(request, request.reply) for request in requests if request.reply is not None]
-        return {name: value for one in reversed(answered) for name, value in self._values(*one)}
+        return {name: value for one in reversed(answered) for name, value in self._values(*one).items()}
 
-    def _values(self, request: _Request, reply: Reply) -> Iterator[tuple[str, int]]:
-        """Yield the registers in the reply to a read and to a ping."""
+    def _values(self, request: _Request, reply: Reply) -> dict[str, int]:
+        """Return the registers in the reply to a read or a ping."""
         _, kind, parameters = request.instruction
         if reply.error or kind not in (READ, PING):
-            return
-        start = int.from_bytes(parameters[:2], "little") if kind == READ else 0
-        for name, register in self._table.items():
-            at = register.address - start
-            # After the Model Number, a ping reports the firmware, which has another address.
-            if 0 <= at <= len(reply.data) - register.size and (kind == READ or at == 0):
-                yield name, register.decode(reply.data[at : at + register.size])
+            return {}
+        if kind == PING:  # after the Model Number, it reports the firmware, which has another address
+            return self._table.decoded(0, reply.data[:2])
+        return self._table.decoded(int.from_bytes(parameters[:2], "little"), reply.data)
 
     def _write(self, name: str, value: int) -> None:
         with suppress(RequestRejected):
