@@ -230,11 +230,11 @@ def test_search_names_the_sensor_on_a_rig_head():
         bench.computer.serial_port("ttyUSB1", serial="HEAD")
         bench.devices.imu.who_am_i = 0x70
         scan = DeviceScan()
-        found = [one for one in run_checks(bench.context, scan.checks) if one.code == "head"]
+        found = [one for one in scan.find_servos(bench.context) if one.code == "head"]
         assert [one.evidence["model"] for one in found] == ["MPU-6500"]
         assert scan.settings["imu", "model"] == "mpu6500"
         bench.devices.imu.who_am_i = 0x00
-        codes = {one.evidence.get("error_code") for one in run_checks(bench.context, DeviceScan().checks)}
+        codes = {one.evidence.get("error_code") for one in DeviceScan().find_servos(bench.context)}
         assert DeviceMismatch.code in codes
 
 
