@@ -51,17 +51,13 @@ def reasons(legs: Sequence[Leg]) -> list[str]:
 class LinearFit:
     """Parameters (p,), and the residuals (n,) with their standard uncertainties, in degrees.
 
-    ``scatter``, ``gyro`` and ``encoder`` (p,) are the contributions of the legs' scatter, of the gyro and of the
-    encoder's resolution to the standard uncertainties of the parameters. ``gyro_deg`` and ``encoder_deg`` are the
-    standard uncertainties of these sources, for a leg and for a rest.
+    ``scatter`` (p,) is the contribution of the legs' scatter to the standard uncertainties of the parameters;
+    ``stated`` has the standard uncertainty of each other source, in degrees, and its contributions (p,).
     """
 
     values: NDArray[np.float64]
     scatter: NDArray[np.float64]
-    gyro: NDArray[np.float64]
-    gyro_deg: float
-    encoder: NDArray[np.float64]
-    encoder_deg: float
+    stated: dict[str, tuple[float, NDArray[np.float64]]]
     residuals_deg: NDArray[np.float64]
     residual_sigma_deg: NDArray[np.float64]
 
@@ -72,14 +68,14 @@ class LinearFit:
 
     def budget(self, parameter: int, unit: str) -> list[Contribution]:
         """Return the uncertainty budget of a parameter in ``unit``."""
-        found = [Contribution("scatter of the legs about the fit", "A", float(self.scatter[parameter]), unit)]
-        for source, part, sigma_deg in (
-            ("noise and zero of the gyro, as stated for a leg", self.gyro, self.gyro_deg),
-            ("resolution of the encoder at a rest", self.encoder, self.encoder_deg),
-        ):
-            if sigma_deg:
-                found.append(Contribution(source, "B", sigma_deg, "°", float(part[parameter]) / sigma_deg))
-        return found
+        return [
+            Contribution("scatter of the legs about the fit", "A", float(self.scatter[parameter]), unit),
+            *(
+                Contribution(source, "B", sigma_deg, "°", float(part[parameter]) / sigma_deg)
+                for source, (sigma_deg, part) in self.stated.items()
+                if sigma_deg
+            ),
+        ]
 
 
 def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float) -> LinearFit:
@@ -96,11 +92,13 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
     encoder per unit of each parameter. ``resolution_deg`` is the angle of one encoder count.
     """
     n, parameters = design.shape
+    # The covariance: the gyro's noise, and rests that are uniform within a count and shared by neighbours.
     count = resolution_deg**2 / 12
     shared = np.diag(np.full(n, 2 * count)) - count * (np.eye(n, k=1) + np.eye(n, k=-1))
     gyro = np.diag([leg.sigma_deg**2 for leg in legs])
     covariance = gyro + shared
     encoder = np.array([leg.encoder_deg for leg in legs])
+    # Least squares of what the root of the covariance makes independent and of unit variance.
     root = np.linalg.cholesky(covariance)
     white, white_encoder = np.linalg.solve(root, design), np.linalg.solve(root, encoder)
     values = np.linalg.lstsq(white, white_encoder, rcond=None)[0]
@@ -114,10 +112,10 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
     return LinearFit(
         values,
         scatter=np.sqrt(np.diag(spread) * chi_square / weight),
-        gyro=stated(gyro),
-        gyro_deg=sqrt(float(np.diag(gyro).mean())),
-        encoder=stated(shared),
-        encoder_deg=sqrt(count),
+        stated={
+            "noise and zero of the gyro, as stated for a leg": (sqrt(float(np.diag(gyro).mean())), stated(gyro)),
+            "resolution of the encoder at a rest": (sqrt(count), stated(shared)),
+        },
         residuals_deg=encoder - design @ values,
         residual_sigma_deg=np.sqrt(np.diag(covariance)),
     )

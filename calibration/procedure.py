@@ -8,7 +8,7 @@ a bench.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Self
 
 from calibration.outcome import as_json, in_force, outcome_text
@@ -88,22 +88,11 @@ class Evaluation:
         self.estimates[name] = found = Estimate(float(value), budget, unit)
         return found
 
-    def result(self, *, device: Any = None, reference: str = "", operator: str = "", **when: Any) -> CalibrationResult:
-        """Return the dated result for a device; ``when`` are ``when_utc`` and ``valid_days`` of the result."""
-        return CalibrationResult(
-            name=self.name,
-            estimates=self.estimates,
-            residual=self.residual,
-            limit=self.limit,
-            residual_unit=self.residual_unit,
-            rejections=tuple(self.rejections),
-            settings=self.settings,
-            reference=reference,
-            operator=operator,
-            device=device or {},
-            evidence=self.evidence,
-            **when,
-        )
+    def result(self, **about: Any) -> CalibrationResult:
+        """Return the dated result; ``about`` are the attributes of `CalibrationResult` that an evaluation lacks."""
+        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "proposed"}
+        own |= {"rejections": tuple(self.rejections), "settings": self.settings}
+        return CalibrationResult(**{"reference": "", "operator": "", "device": {}} | own | about)
 
 
 Measured = Generator[Event | Ask | Progress, None, Evaluation]

@@ -11,7 +11,6 @@ by placement and light between two placements. The differences between placement
   with σ the scatter about the mean of the azimuth.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import ceil, floor, sqrt
@@ -44,13 +43,6 @@ MAX_DRIFT = 0.02
 """Largest loss of similarity between the first and the last placement, compared with consecutive placements."""
 MIN_SIMILARITY = 0.7
 """Smallest similarity of two views of the same object at the same azimuth."""
-
-
-@dataclass(frozen=True, slots=True)
-class Placement:
-    """One placement: the descriptors of its rounds, uint8 (rounds, azimuths, levels)."""
-
-    descriptors: NDArray[np.uint8]
 
 
 def plot(result: CalibrationResult) -> Chart | None:
@@ -92,7 +84,7 @@ class Repeatability(Procedure):
             )
         # The operator places the object again each time: views of one placement share its errors.
         viewer = Viewer(bench.camera, bench.config)
-        placements: list[Placement] = []
+        placements: list[list[list[NDArray[np.uint8]]]] = []
         index = 0
         for number in range(1, self.placements + 1):
             again = "again: take it off and put it back" if number > 1 else "as it stands when you enroll it"
@@ -116,10 +108,13 @@ class Repeatability(Procedure):
                         index += 1
                     rounds.append(views)
                 table.goto(0.0)
-            placements.append(Placement(np.array(rounds)))
+            placements.append(rounds)
         identify = bench.config.identify
         found = evaluate(
-            placements, error_rate=self.error_rate, views=identify.min_views, first_step_deg=identify.first_step_deg
+            np.array(placements),
+            error_rate=self.error_rate,
+            views=identify.min_views,
+            first_step_deg=identify.first_step_deg,
         )
         found.evidence["object"] = self.thing
         return found
@@ -132,16 +127,17 @@ def needed_placements(error_rate: float) -> int:
 
 
 def evaluate(
-    placements: Sequence[Placement], *, error_rate: float, views: int, first_step_deg: float = 90.0, seed: int = 0
+    placements: NDArray[np.uint8], *, error_rate: float, views: int, first_step_deg: float = 90.0, seed: int = 0
 ) -> Evaluation:
     """Evaluate the similarity of repeated views of one object at one mark.
 
+    ``placements`` are descriptors, uint8 (placements, rounds, azimuths, levels).
     ``error_rate`` is the share of known objects that may fall below ``identify.repeatability``. The shortest decision
     has ``views``, ``first_step_deg`` apart. ``seed`` is that of the bootstrap over azimuths.
     """
     found = Evaluation(name=NAME, residual_unit="of similarity", limit=1.0 - MIN_SIMILARITY)
-    within = np.array([_similar(s.descriptors[0], s.descriptors[1]) for s in placements])
-    between = np.array([_similar(a.descriptors[0], b.descriptors[0]) for a, b in combinations(placements, 2)])
+    within = np.array([_similar(first, second) for first, second, *_ in placements])
+    between = np.array([_similar(a, b) for a, b in combinations(placements[:, 0], 2)])
     needed = needed_placements(error_rate)
     found.reject_if(
         len(placements) < needed,
@@ -193,16 +189,14 @@ def evaluate(
 
 def _similar(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the Tanimoto similarity of views of the same azimuth, float64 (azimuths,)."""
-    return np.array([float(hbr.tanimoto(x[None], y[None])[0, 0]) for x, y in zip(a, b, strict=True)])
+    return np.diag(hbr.tanimoto(a, b))
 
 
-def _by_step(placements: Sequence[Placement]) -> list[dict[str, float]]:
+def _by_step(placements: NDArray[np.uint8]) -> list[dict[str, float]]:
     """Return median and tenth percentile of the similarity of views that are 0, 1, 2, ... steps apart."""
     curve = []
     for step in range(AZIMUTHS // 2 + 1):
-        values = np.concatenate(
-            [_similar(s.descriptors[0], np.roll(s.descriptors[1], step, axis=0)) for s in placements]
-        )
+        values = [_similar(first, np.roll(second, step, axis=0)) for first, second, *_ in placements]
         curve.append(
             {
                 "step_deg": step * 360.0 / AZIMUTHS,

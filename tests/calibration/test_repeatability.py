@@ -1,13 +1,11 @@
 """The similarity of repeated views, and the settings that follow from it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 import hbr
 from calibration.procedure import Evaluation
-from calibration.repeatability import AZIMUTHS, Placement, Repeatability, evaluate, needed_placements
+from calibration.repeatability import AZIMUTHS, Repeatability, evaluate, needed_placements
 from rig.calibrations import RejectionCode, apply_results
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
@@ -15,7 +13,7 @@ from rig.events.events import Accepted
 from tests.calibration.drawn import codes
 
 
-def drawn(rng: np.random.Generator, placements: int, *, flips: int = 4, drift: int = 0) -> list[Placement]:
+def drawn(rng: np.random.Generator, placements: int, *, flips: int = 4, drift: int = 0) -> np.ndarray:
     """Return placements whose views differ in some levels; with a drifting light the differences grow."""
     truth = rng.integers(0, 8, (AZIMUTHS, 144))
 
@@ -27,10 +25,10 @@ def drawn(rng: np.random.Generator, placements: int, *, flips: int = 4, drift: i
         levels[:, :drifted] = 7 - levels[:, :drifted]
         return levels
 
-    return [Placement(np.array([seen(drift * k) for _ in range(2)], np.uint8)) for k in range(placements)]
+    return np.array([[seen(drift * k) for _ in range(2)] for k in range(placements)], np.uint8)
 
 
-def fit(placements: list[Placement], error_rate: float = 0.02) -> Evaluation:
+def fit(placements: np.ndarray, error_rate: float = 0.02) -> Evaluation:
     return evaluate(placements, error_rate=error_rate, views=2)
 
 
@@ -40,10 +38,10 @@ def test_stated_share_of_later_placements_is_below_the_threshold():
     for _ in range(30):
         truth_rng = np.random.default_rng(rng.integers(1 << 32))
         placements = drawn(truth_rng, needed_placements(0.05) + 2)
-        *known, late = placements
+        known, late = placements[:-1], placements[-1]
         result = fit(known, 0.05)
         assert result.passed, result.rejections
-        later = np.array([np.diag(hbr.tanimoto(s.descriptors[0], late.descriptors[0])) for s in known])
+        later = np.array([np.diag(hbr.tanimoto(one[0], late[0])) for one in known])
         decided = (later + np.roll(later, -3, axis=1)) / 2  # the shortest decision: two views, 90° apart
         below += int((decided < result.settings["identify.repeatability"]).sum())
         n += decided.size
@@ -65,7 +63,7 @@ def test_drifting_light_and_another_object_are_rejected():
         fit(drawn(np.random.default_rng(3), 5, flips=2, drift=3))
     )
     placements = drawn(np.random.default_rng(4), 4)
-    others = [replace(s, descriptors=np.roll(s.descriptors, i, axis=2)) for i, s in enumerate(placements)]
+    others = np.array([np.roll(one, i, axis=2) for i, one in enumerate(placements)])
     assert RejectionCode.SIMILARITY_TOO_LOW in codes(fit(others))
 
 

@@ -22,7 +22,12 @@ def test_a_silhouette_survives_its_text(seed: int, height: int, width: int) -> N
     np.testing.assert_array_equal(mask_from(mask_text(found), (height, width)), found)
 
 
-@given(st.text(max_size=60) | st.binary(max_size=60).map(lambda data: data.hex()) | st.none() | st.integers())
+@given(
+    st.text("0123456789abcdefgh=+/ é", max_size=60)
+    | st.binary(max_size=60).map(lambda data: data.hex())
+    | st.none()
+    | st.integers()
+)
 @examples(20)
 def test_damaged_text_is_an_error_of_the_value(text: object) -> None:
     with pytest.raises(ValueError, match="silhouette"):
