@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import degrees
 from typing import Any
 
@@ -93,13 +94,9 @@ def take_views(
 
 def coverage(views: Sequence[BoardView], size: tuple[int, int]) -> NDArray[np.int64]:
     """Return the number of corners in each cell of the frame, int (rows, columns); ``size`` is (width, height)."""
-    columns, rows = GRID
-    cells = np.zeros((rows, columns), dtype=np.int64)
-    for view in views:
-        x = np.clip((view.corners_px[:, 0] * columns / size[0]).astype(int), 0, columns - 1)
-        y = np.clip((view.corners_px[:, 1] * rows / size[1]).astype(int), 0, rows - 1)
-        np.add.at(cells, (y, x), 1)
-    return cells
+    x, y = np.concatenate([np.empty((0, 2)), *(view.corners_px for view in views)]).T
+    cells, _, _ = np.histogram2d(y, x, bins=GRID[::-1], range=((0, size[1]), (0, size[0])))
+    return np.asarray(cells, np.int64)
 
 
 def reject_loose_board(
@@ -111,9 +108,7 @@ def reject_loose_board(
     the camera's frame, for each view.
     """
     worst = 0.0
-    for (a, (rotation_a, _)), (b, (rotation_b, _)) in zip(
-        zip(views[:-1], poses[:-1], strict=True), zip(views[1:], poses[1:], strict=True), strict=True
-    ):
+    for (a, (rotation_a, _)), (b, (rotation_b, _)) in pairwise(zip(views, poses, strict=True)):
         if a.stand != b.stand:
             continue
         between = cv2.Rodrigues(rotation_b)[0] @ cv2.Rodrigues(rotation_a)[0].T
@@ -181,6 +176,5 @@ def plot_views(result: CalibrationResult, limit_px: float) -> Chart | None:
 
 def _words(seen: BoardDetection, board: CharucoBoard, views: Sequence[BoardView], bench: Bench) -> str:
     identity = bench.camera.identity
-    cells = coverage(views, (identity.width, identity.height)) if views else np.zeros(GRID)
-    covered = float((cells > 0).mean())
+    covered = float((coverage(views, (identity.width, identity.height)) > 0).mean())
     return f"{seen.ids.size} of {board.corners} corners; {percent(covered, 0)} of the frame covered so far"

@@ -185,10 +185,12 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
         frame, rates, x, down, y = np.concatenate(parts).T
         centre = np.array([centre for _, centre in bands])
         own = band[:, None] == np.arange(len(bands))
+        # The times of middle row and read-out, and for each band the backlash between passes in opposite directions.
         design = np.column_stack([x, x * centre[band], -down[:, None] * own])
         known = np.zeros(design.shape[1])
         known[1] = 1 / READOUT_S  # a narrow object does not show the read-out time
         known[2:] = 1 / 90.0  # no slow pass in the other direction
+        # Robust least squares: comparisons beyond 2.5 σ count less (Huber), and 1.4826 median deviations are one σ.
         weight = np.ones(len(x))
         for _ in range(5):
             rows = np.vstack([design * weight[:, None], np.diag(known)])
@@ -214,7 +216,8 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
         sigmas.append(sqrt(max(float(np.square(part).sum()), 1e-12)) / max(power, 1e-12))
     birge = max(1.0, float(np.square(np.divide(slopes, sigmas)).sum()) / max(len(bands) - 2, 1))
     middle_sigma_s, readout_sigma_s = np.sqrt(birge * variances).T
-    # The mean over all comparisons of a frame.
+    # The mean over all comparisons of a frame. Its variance is that of the texture, which does not depend on the speed,
+    # and that of the jitter, which grows with the square of the speed: a line shows both.
     precise = np.square(weight)
     total = np.bincount(number, precise)
     seen = total > 0
@@ -224,6 +227,7 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
     variance = np.square(mean / np.maximum(1, np.abs(mean) / (2.5 * spread_deg)))  # a frame may have no usable rows
     line = np.column_stack([np.ones_like(rate), np.square(rate)])
     (rest, growth), *_ = np.linalg.lstsq(line, variance, rcond=None)
+    # The square of a normal deviation has twice the squared variance; its mean fourth power is three of these.
     noise = np.linalg.inv(line.T @ line)[1, 1] * 2 * float(np.square(variance).mean() / 3)
     jitter_s = sqrt(max(float(growth), 0.0))
     return Fit(

@@ -15,6 +15,7 @@ camera.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import combinations
 from math import degrees, hypot, radians
 from typing import Any
 
@@ -375,12 +376,9 @@ def first_axis(
     """Return direction and a point of the axis, from the rotations between poses and the circles of the middles."""
     direction = np.zeros(3)
     equations, values = [], []
-    for (a, (rotation_a, shift_a)), (b, (rotation_b, shift_b)) in (
-        (first, second)
-        for i, first in enumerate(zip(views, poses, strict=True))
-        for second in list(zip(views, poses, strict=True))[i + 1 :]
-        if first[0].stand == second[0].stand and abs(second[0].table_deg - first[0].table_deg) > 15.0
-    ):
+    for (a, (rotation_a, shift_a)), (b, (rotation_b, shift_b)) in combinations(zip(views, poses, strict=True), 2):
+        if a.stand != b.stand or abs(b.table_deg - a.table_deg) <= 15.0:  # too little rotation shows no axis
+            continue
         before, after = cv2.Rodrigues(rotation_a)[0], cv2.Rodrigues(rotation_b)[0]
         between = after @ before.T
         rotated = cv2.Rodrigues(between)[0].ravel()
