@@ -123,10 +123,7 @@ def test_servo_moves_by_the_counts_and_units_of_its_model(file):
     assert not end.moving
     assert servo.reach_deg == pytest.approx((-series.extended * one, series.extended * one))
 
-
-@pytest.mark.parametrize("file", [name for name in FILES if name != "dynamixel" and name not in REJECTED])
-def test_limits_of_the_servo_are_respected_and_read_in_its_units(file):
-    place = places(file)
+    # The limits in its memory are respected, and read in its units.
     wires, servo = driven_on_a_wire(file)
     memory = wires.device.memory
     for limit in ("Velocity Limit", "Acceleration Limit"):

@@ -52,7 +52,7 @@ def test_opening_resets_the_sensor(bench: ImuBench) -> None:
     [
         *((0x70, "MPU-6500", "mpu6500"), (0x71, "MPU-9250", "mpu9250"), (0x73, "MPU-9255", None)),
         *((0x72, "MPU-6050 clone", "mpu6050_clone"), (0x98, "MPU-6050 clone", "mpu6050_clone")),
-        *((0x42, "DS3231", None), (0x00, "SDA is held low", None), (0xFF, "not connected", None)),
+        *((0x42, "another chip", None), (0x00, "SDA is held low", None), (0xFF, "not connected", None)),
     ],
 )
 def test_wrong_chip_is_named_and_set_if_it_has_a_driver(who_am_i: int, likely: str, model: str | None) -> None:
@@ -121,11 +121,15 @@ def test_clone_with_implausible_samples_is_rejected(spoil: Any, problem: str) ->
             bench.open(Mpu6050Clone)
 
 
-def test_missing_sensor_names_address_and_next_step(bench: ImuBench) -> None:
-    bench.bus.detach(AT)
-    with pytest.raises(DeviceNotFound, match="0x68") as caught:
-        bench.open()
-    for hint in ("AD0", "i2cdetect -y", "SDA"):
+@pytest.mark.parametrize(
+    ("device", "driver", "pin"), [(SimMpu6050, Mpu6050, "AD0"), (SimBno055, partial(Bno055, address=0x28), "ADR")]
+)
+def test_missing_sensor_names_address_and_next_step(device: Any, driver: Any, pin: str) -> None:
+    with ImuBench(device=device, driver=driver) as bench:
+        bench.bus.detach(bench.sensor.address)
+        with pytest.raises(DeviceNotFound, match=f"{bench.sensor.address:#04x}") as caught:
+            bench.open()
+    for hint in (pin, "i2cdetect -y", "SDA"):
         assert hint in caught.value.next_step
 
 
