@@ -121,7 +121,6 @@ class OpenCvCamera:
         self._missing = capture.get(_UNKNOWN_PROPERTY)
         self.modes = capture.modes()
         self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
-        self.returns = 0
         self._clock = clock
         # Lock the settings, then read back what the camera made of them.
         self._supported: set[int] = set()
@@ -358,7 +357,6 @@ class OpenCvCamera:
                     "rejected_settings": [n.setting for n in rejected_settings],
                 },
             )
-        self.returns += 1
 
     def _grab_now(self, meanwhile: Callable[[], object] | None) -> int | None:
         first_ns = self._clock.now_ns()

@@ -221,9 +221,10 @@ class DynamixelBus:
                         return replies
                     if rejected.error != CORRUPTED:
                         self.statistics.rejected += 1
-                        raise self._rejected(what, rejected)
+                        raise _rejected(what, rejected)
                     result, replies = COMM_RX_CORRUPT, {}  # the instruction was damaged on its way: send it again
-                self._count(result)
+                self.statistics.corrupt += result == COMM_RX_CORRUPT
+                self.statistics.timeouts += result != COMM_RX_CORRUPT
             # No attempt succeeded: say what the operator can check.
             missing = [device_id for device_id in device_ids if device_id not in replies]
             advice: SomeSteps = (
@@ -292,12 +293,6 @@ class DynamixelBus:
             asked += 1
         return max(address - (asked - size), 0), asked
 
-    def _count(self, result: int) -> None:
-        if result == COMM_RX_CORRUPT:
-            self.statistics.corrupt += 1
-        else:
-            self.statistics.timeouts += 1
-
     def _silent(self, what: str, device_ids: Sequence[int], reason: str, next_step: SomeSteps) -> DeviceSilent:
         ids = ", ".join(map(str, device_ids))
         return DeviceSilent(
@@ -306,13 +301,13 @@ class DynamixelBus:
             evidence={"reason": reason, "attempts": self._retries + 1, "baud": self.port.baudrate},
         )
 
-    def _rejected(self, what: str, reply: Reply) -> RequestRejected:
-        reason = REJECTIONS.get(reply.error, f"error {reply.error}")
-        return RequestRejected(
-            f"Servo {reply.bus_id} rejected the {what}: {reason}.",
-            next_step=(Do.STATUS(), "A tripped watchdog or a hardware error prevents motion."),
-            evidence={"status_error": reply.error, "alert": bool(reply.alert)},
-        )
+
+def _rejected(what: str, reply: Reply) -> RequestRejected:
+    return RequestRejected(
+        f"Servo {reply.bus_id} rejected the {what}: {REJECTIONS.get(reply.error, f'error {reply.error}')}.",
+        next_step=(Do.STATUS(), "A tripped watchdog or a hardware error prevents motion."),
+        evidence={"status_error": reply.error, "alert": bool(reply.alert)},
+    )
 
 
 def watchdog_units(timeout_s: float) -> int:

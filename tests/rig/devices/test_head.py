@@ -29,7 +29,7 @@ from rig.devices.head.samples import head_sensor
 from rig.devices.mpu6050 import DRIVERS
 from sim.clock import VirtualClock
 from sim.head.serial_port import HeadSerial
-from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone
+from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
 from tests.contract.heads import AVR_NIGHTLY, mpu6050, simulated_head, switch_on
 from tests.rig.devices.scripted_serial import ScriptedSerial
@@ -115,14 +115,6 @@ def test_every_sensor_of_a_driver_is_known_to_the_firmware_and_has_its_own_scale
         world.clock.sleep(0.1)
         assert imu.temperature_c() == pytest.approx(31.5, abs=0.01)
         imu.close()
-
-
-def test_clone_with_implausible_samples_is_rejected():
-    with simulated_head() as (head, world):
-        head.attach(0x68, clone := SimMpu6050Clone(head.world_at_board_time))
-        clone.inertial.accel_bias_g = clone.inertial.up
-        with pytest.raises(DeviceMismatch, match=r"clone at .* of the rig head at .*: gravity is 2\.0"):
-            RigHead(HeadSerial(head), world.clock, sensor_of("mpu6050_clone")())
 
 
 def test_only_deadmen_of_the_head_can_be_configured():
