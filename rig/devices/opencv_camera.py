@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from math import floor
 from typing import Any, Final
 
 import cv2
@@ -289,22 +288,12 @@ class OpenCvCamera:
     def _await(self, meanwhile: Callable[[], object]) -> None:
         """Wait until `grab` can return at once, because it blocks for ten seconds if a stream of V4L2 hangs.
 
-        If the source cannot wait, this waits until shortly before the next frame, estimated from the last ones.
-
         Raises `DeviceSilent`: the stream hangs.
         """
         limit_s, begun_ns = max(TIMEOUT_S, 3 * max(self._waits_s)), self._clock.now_ns()
-        while (ready := self._capture.wait(_SLICE_S)) is False:
+        while self._capture.wait(_SLICE_S) is False:
             if seconds_between(begun_ns, self._clock.now_ns()) > limit_s:
                 raise self._no_frames(1, limit_s)
-            meanwhile()
-        if ready:
-            return
-        spacing_s, now_ns = max(self._waits_s), self._clock.now_ns()
-        frames = 1 + floor(seconds_between(self._arrived_ns, now_ns) / spacing_s)
-        due_ns = self._arrived_ns + round((frames * spacing_s - _SLICE_S / 2) * 1e9)
-        while (left_s := seconds_between(self._clock.now_ns(), due_ns)) > 0:
-            self._clock.sleep(min(left_s, _SLICE_S))
             meanwhile()
 
     def _grab(self, meanwhile: Callable[[], object] | None = None) -> int | None:
