@@ -198,6 +198,16 @@ def test_restarted_head_reports_it_and_continues_to_measure(opened):
     assert opened.imu.fault is None
 
 
+def test_hanging_firmware_is_restarted_by_its_watchdog(opened):
+    switch_on(opened)
+    opened.head.hang()
+    opened.clock.sleep(1.0)
+    assert opened.head.resets == [Reset.WATCHDOG]
+    assert not opened.head.relay_closed
+    with pytest.raises(HeadRestarted, match="hung"):
+        opened.imu.check()
+
+
 def test_outputs_and_faults_do_not_depend_on_the_sensor(opened):
     opened.head.detach(0x68)
     opened.clock.sleep(2.0)
