@@ -5,21 +5,22 @@ and it can be copied again without harm. An image is complete under its name or 
 """
 
 import os
+import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from math import inf
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from secrets import token_hex
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.catalog.places import file_mode, files_within, image_file, make_folder_within
-from rig.config.catalog_place import CatalogPlace
-from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
-from rig.core.files import MAX_SINGLE_SYNCS, open_new, sync_file, sync_folder
+from rig.catalog.columns import FIX
+from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
+from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
+from rig.core.files import make_folder, sync, sync_file, sync_folder
 from rig.core.files import read as read_local
 from rig.core.files import write as write_local
 from rig.core.next_steps import Do
@@ -109,37 +110,19 @@ class Images:
                 os.utime(path)  # `collect_garbage` spares new files: the row of this one is not stored yet
             if settled:
                 sync_file(path)  # the process that wrote it may not have waited, or was killed before it did
+                sync_folder(path.parent)
         else:
-            if not path.parent.is_dir():
-                make_folder_within(self.root, path.parent, settled=settled)
+            mode = file_mode(self.root)
+            if not path.parent.is_dir():  # who may read its files may also enter it
+                make_folder(path.parent, within=self.root, mode=mode | (mode & 0o444) >> 2)
             # a name of its own: another process may write the same image now
-            part = path.with_name(f"{name}.{token_hex(8)}.part")
-            try:
-                with open_new(part, mode=file_mode(self.root)) as file:
-                    file.write(content)
-                    file.flush()
-                    if settled:
-                        os.fsync(file.fileno())
-                part.replace(path)
-            except BaseException:
-                with suppress(OSError):
-                    part.unlink()
-                raise
-        if settled:
-            sync_folder(path.parent)
+            write_local(path, content, mode=mode, part=f".{token_hex(8)}.part", settled=settled)
         return name
 
     def settle(self, names: Iterable[str]) -> None:
         """Wait until these images are durable."""
-        several = set(names)
-        if len(several) > MAX_SINGLE_SYNCS:
-            os.sync()  # one by one, thousands of small files take minutes on some disks
-            return
-        paths = [self.file(name) for name in several]
-        for path in paths:
-            sync_file(path)
-        for folder in {path.parent for path in paths} | {self.root / FOLDER, self.root}:
-            sync_folder(folder)
+        paths = [self.file(name) for name in set(names)]
+        sync([*paths, *{path.parent for path in paths}, self.root / FOLDER, self.root])
 
     def names(self, *, before_s: float = inf) -> set[str]:
         """Return the names of the files that were written before this time, in seconds since 1970."""
@@ -321,3 +304,44 @@ def _written_s(info: Mapping[str, Any]) -> float:
     """Return when a file of a store was written, in seconds since 1970; 0 if the store does not say."""
     when = info.get("LastModified") or info.get("mtime") or 0.0
     return float(when.timestamp() if isinstance(when, datetime) else when)
+
+
+# Files in the folder of a catalog. A catalog may come from an untrusted sender: its records and its folder can contain
+# paths and links that lead out. Nothing outside of it is read, written or removed.
+
+
+def image_file(root: Path, path: str) -> Path:
+    """Return the file of an image at a path within ``images/`` of the catalog in the folder ``root``.
+
+    Raises `CatalogDamaged`: a link leads out of the images of the catalog, or the file is a pipe or a device.
+    """
+    for part in (*reversed(PurePosixPath(path).parents), PurePosixPath(path)):
+        with suppress(FileNotFoundError):
+            kind = stat.S_IFMT((root / part).stat(follow_symlinks=part == PurePosixPath()).st_mode)
+            if kind not in (stat.S_IFREG, stat.S_IFDIR):
+                raise leads_out(root / part)
+    return root / path
+
+
+def files_within(folder: Path) -> Iterator[Path]:
+    """Yield the files and links in a folder and its subfolders. No link is followed."""
+    if folder.is_symlink():
+        raise leads_out(folder)
+    for path, folders, names in os.walk(folder):
+        yield from (Path(path, name) for name in [*names, *(one for one in folders if Path(path, one).is_symlink())])
+
+
+def file_mode(root: Path) -> int:
+    """Return the permissions of new files: those of the database, so that a shared catalog is shared completely.
+
+    Without a database in the folder they are those of the folder.
+    """
+    file = root / DATABASE_NAME
+    return stat.S_IMODE((file if file.exists() else root).stat().st_mode) & 0o666
+
+
+def leads_out(path: Path) -> CatalogDamaged:
+    """Return the error for something in the folder of a catalog that leads out of it."""
+    return CatalogDamaged(
+        f"{os.fspath(path)!r} of the catalog leads to another place; nothing was changed.", next_step=FIX
+    )

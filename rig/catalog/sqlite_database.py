@@ -6,8 +6,9 @@ Decision: docs/decisions/0009.
 import os
 import re
 import sqlite3
+import stat
 import sys
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,10 +21,11 @@ from rig.catalog.columns import FIX
 from rig.catalog.database import APPLICATION, Database, check_properties, first_properties, properties
 from rig.catalog.facts import FACTS, SCHEMA_VERSION, Entry, Row, json_text
 from rig.catalog.failures import absent
-from rig.catalog.places import check_folder
+from rig.catalog.images import leads_out
 from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
 from rig.core.errors import CatalogDamaged, CatalogError
 from rig.core.files import json_values, make_folder, sync_folder
+from rig.views.image_files import IMAGE_FOLDER
 
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
@@ -58,8 +60,8 @@ class SqliteDatabase(Database):
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
     def _open(self, *, create: bool) -> None:
-        if not database_exists(self.root):
-            if not create:
+        if not self.place.database_file.exists():
+            if not create or (self.root.exists() and not self.root.is_dir()):
                 raise absent(self.root)
             check_folder(self.root)
             parent = next(parent for parent in self.root.parents if parent.exists())
@@ -120,17 +122,41 @@ class SqliteDatabase(Database):
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
                 connection.execute("COMMIT")
-            try:
+            with suppress(FileExistsError):  # another process was faster
                 self.place.database_file.hardlink_to(made)
-            except FileExistsError:  # another process was faster, or one was killed after it had created an empty file
-                self._replace_empty(made)
         sync_folder(self.root)
 
-    def _replace_empty(self, made: Path) -> None:
-        with closing(self._connect()) as lock:
-            lock.execute("BEGIN EXCLUSIVE")  # only one of the processes that find the same empty file continues
-            if not self.place.database_file.stat().st_size:
-                made.replace(self.place.database_file)
+
+_OWN: Final = (DATABASE_NAME, IMAGE_FOLDER)
+_BESIDE: Final = tuple(f"{DATABASE_NAME}-{suffix}" for suffix in ("wal", "shm", "journal"))
+"""Files that SQLite itself writes beside the database."""
+
+
+def check_folder(root: Path) -> None:
+    """Check the folder of a catalog before SQLite opens a file in it.
+
+    Raises `CatalogDamaged`: something of the catalog in the folder ``root`` is a link; a file that belongs to SQLite
+    has a second name or is a pipe or a device; or there is a rollback journal, which this program does not use.
+    """
+    for name in _OWN:
+        if (root / name).is_symlink():
+            raise leads_out(root / name)
+    for name in _BESIDE:
+        with suppress(FileNotFoundError):
+            found = (root / name).lstat()
+            if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                raise leads_out(root / name)
+            # SQLite plays a rollback journal back before this program can look at anything. One with a super-journal
+            # record names any other file, and SQLite then deletes that file. This program leaves no such journal after
+            # a kill: it writes with a write-ahead log only. The log itself (-wal) and its index (-shm) name no file;
+            # the pages of the log are checked like the database.
+            if found.st_size and name.endswith("-journal"):
+                raise CatalogDamaged(
+                    f"{os.fspath(root / name)!r} is a journal of another program. SQLite would change the catalog by "
+                    "it, and delete the file that it may name. Nothing was opened or changed.",
+                    next_step=FIX,
+                    evidence={"bytes": found.st_size},
+                )
 
 
 def connect(root: Path, mode: str, busy_timeout_s: float) -> sqlite3.Connection:
@@ -169,14 +195,6 @@ def _dialect() -> Dialect:
     engine = create_engine(_URL, poolclass=NullPool, json_serializer=json_text, json_deserializer=json_values)
     with engine.connect():  # asks SQLite for its version
         return engine.dialect
-
-
-def database_exists(root: Path) -> bool:
-    """Return whether a folder has a database. A program that was killed may have left an empty file."""
-    if root.exists() and not root.is_dir():
-        raise absent(root)
-    file = root / DATABASE_NAME
-    return file.exists() and file.stat().st_size > 0
 
 
 def _check_kind(connection: Connection, root: Path) -> None:

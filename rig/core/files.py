@@ -3,6 +3,7 @@
 import json
 import os
 import stat
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -50,20 +51,25 @@ def _reject_constant(name: str) -> None:
     raise ValueError(f"{name} is not a number in JSON")
 
 
-def write(path: Path, content: bytes, *, mode: int = 0o666) -> None:
-    """Write a file completely or not at all; on return it is on the disk. The umask limits its ``mode``."""
-    temporary = path.with_name(f"{path.name}.part")
+def write(path: Path, content: bytes, *, mode: int = 0o666, part: str = ".part", settled: bool = True) -> None:
+    """Write a file completely or not at all; on return it is on the disk if it is ``settled``.
+
+    The umask limits its ``mode``. Until it is complete, its name ends in ``part``.
+    """
+    temporary = path.with_name(f"{path.name}{part}")
     try:
         with open_new(temporary, mode=mode) as file:
             file.write(content)
             file.flush()
-            os.fsync(file.fileno())
+            if settled:
+                os.fsync(file.fileno())
         temporary.replace(path)
     except BaseException:
         with suppress(OSError):
             temporary.unlink()
         raise
-    sync_folder(path.parent)
+    if settled:
+        sync_folder(path.parent)
 
 
 def open_new(path: Path, *, mode: int = 0o666) -> BinaryIO:
@@ -99,7 +105,11 @@ def sync_file(path: Path) -> None:
 
 def sync_tree(folder: Path) -> None:
     """Wait until everything in a folder is on the disk."""
-    paths = [folder, *folder.rglob("*")]
+    sync([folder, *folder.rglob("*")])
+
+
+def sync(paths: Sequence[Path]) -> None:
+    """Wait until several files and folders are on the disk."""
     if len(paths) > MAX_SINGLE_SYNCS:
         os.sync()  # one by one, thousands of small files take minutes on some disks
         return

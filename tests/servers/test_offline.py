@@ -295,7 +295,7 @@ def test_wrong_password_and_absent_server_have_their_own_messages(
     assert "There is no object 'star'" in missing.stderr
     with Journal.of(place, CLOCK) as journal:
         fill(journal, "star", 2, 30)
-    monkeypatch.setattr("rig.catalog.images.open_new", _full)
+    monkeypatch.setattr("rig.core.files.open_new", _full)
     full = rig("identify", *words)
     assert "is full" in full.stderr
     assert "What is in the journal of this computer is delivered later" in full.stderr
