@@ -179,7 +179,7 @@ def _copy_schema(url: str, source: Path, target: Path) -> None:
     schema = str(before.url).rpartition("%3D")[2]
     (target / "catalog-id").unlink(missing_ok=True)
     made = PostgresDatabase(place, create=True, read_only=False, busy_timeout_s=5.0)
-    with closing(made), made._changes.begin() as connection:
+    with closing(made), made._writes.begin() as connection:
         if connection.execute(text(f"SELECT to_regclass('{schema}.{Property.__tablename__}')")).scalar() is None:
             return
         connection.execute(text(f"DELETE FROM {Property.__tablename__}"))

@@ -62,13 +62,3 @@ def test_listing_reports_a_flipped_byte_of_a_view_and_is_printed(rig, root: Path
     listed, error = map(json.loads, rig("catalog", *words, "--json").stdout.splitlines())
     assert listed
     assert error["code"] == 707
-
-
-@pytest.mark.parametrize("words", [("list",), ("show", "mug"), ("rename", "mug", "cup")])
-def test_nothing_is_said_about_an_object_whose_line_in_the_log_was_changed(
-    rig, root: Path, words: tuple[str, ...]
-) -> None:
-    flip(root, b"a mug with a chip")
-    done = rig("catalog", *words)
-    assert (done.exit_code, done.stdout) == (7, "")
-    assert "Error 707 (catalog damaged): 'mug' in the catalog changed" in done.stderr

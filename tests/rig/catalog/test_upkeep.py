@@ -28,17 +28,31 @@ def names(catalog: Catalog) -> list[str]:
 
 
 class TestEdit:
-    def test_renamed_object_keeps_its_views(self, catalog: Catalog) -> None:
-        fill(catalog, "mug", 2)
-        fill(catalog, "tin", 2)
+    def test_renamed_labelled_and_restored_object_keeps_its_views(self, catalog: Catalog, clock: VirtualClock) -> None:
+        fill(catalog, "mug", 2, label="kitchen", note="chipped")
+        fill(catalog, "tin", 1)
         catalog.rename("mug", " cup ")
         assert derived.views(catalog).object_names == ("cup", "tin")
         assert np.array_equal(catalog.read_image(catalog.object("cup").views[0].image), image(0))
         with pytest.raises(ObjectNotFound):
-            catalog.object("mug")
+            catalog.delete("cup", "mug")
         with pytest.raises(ObjectExists):
             catalog.rename("cup", "tin")
         catalog.rename("cup", "cup")
+        catalog.set_texts("cup", label="lab")
+        catalog.set_texts("cup", note="")
+        with pytest.raises(UsageError):
+            catalog.set_texts("cup", note="\udcff")
+        clock.sleep(5)
+        catalog.delete("cup")
+        assert (names(catalog), len(derived.views(catalog))) == (["tin"], 1)
+        (deleted,) = catalog.objects(deleted=True)
+        assert (deleted.name, deleted.label, deleted.note, deleted.deleted_utc) == ("cup", "lab", "", clock.utc())
+        with pytest.raises(ObjectNotFound, match="'cup'"):
+            catalog.object("cup")
+        catalog.undelete("cup")
+        assert names(catalog) == ["cup", "tin"]
+        assert catalog.object("cup").summary.views == 2
 
     def test_enrollment_continues_under_the_new_name(self, catalog: Catalog) -> None:
         enrollment = catalog.begin("mug", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
@@ -47,33 +61,6 @@ class TestEdit:
         enrollment.add(record(1), image(1))
         enrollment.finish()
         assert catalog.object("cup").summary.views == 2
-
-    def test_label_and_note_are_changed_separately(self, catalog: Catalog) -> None:
-        fill(catalog, "mug", 1, label="kitchen", note="chipped")
-        catalog.set_texts("mug", label="lab")
-        catalog.set_texts("mug", note="")
-        summary = catalog.object("mug").summary
-        assert (summary.label, summary.note) == ("lab", "")
-        with pytest.raises(UsageError):
-            catalog.set_texts("mug", note="\udcff")
-
-    def test_deleted_object_can_be_restored(self, catalog: Catalog, clock: VirtualClock) -> None:
-        fill(catalog, "mug", 2)
-        fill(catalog, "tin", 1)
-        clock.sleep(5)
-        with pytest.raises(ObjectNotFound):
-            catalog.delete("mug", "jar")
-        assert names(catalog) == ["mug", "tin"]
-        catalog.delete("mug")
-        assert names(catalog) == ["tin"]
-        assert len(derived.views(catalog)) == 1
-        (deleted,) = catalog.objects(deleted=True)
-        assert (deleted.name, deleted.deleted_utc) == ("mug", clock.utc())
-        with pytest.raises(ObjectNotFound, match="'mug'"):
-            catalog.object("mug")
-        catalog.undelete("mug")
-        assert names(catalog) == ["mug", "tin"]
-        assert catalog.object("mug").summary.views == 2
 
     def test_name_of_a_deleted_object_is_free(self, catalog: Catalog, clock: VirtualClock) -> None:
         fill(catalog, "mug", 1)
@@ -176,6 +163,10 @@ class TestGarbage:
         clock.sleep(YOUNG_S - 1)
         assert collect_garbage(catalog).files == 0
         clock.sleep(2)
+        assert collect_garbage(catalog, dry_run=True).files == 1
+        catalog.database.images.put(encode(image(7)))  # stored again, it is young
+        assert collect_garbage(catalog).files == 0
+        os.utime(catalog.image_path(name), (written_s, written_s))
         assert collect_garbage(catalog).files == 1
         assert not catalog.image_path(name).exists()
         assert finished(verify(catalog)).findings == ()
@@ -191,11 +182,3 @@ class TestGarbage:
         os.utime(part, (0, 0))
         assert collect_garbage(catalog).files == 1
         assert not part.exists()
-
-    def test_image_that_was_stored_again_is_young(self, catalog: Catalog, clock: VirtualClock) -> None:
-        content = encode(image(7))
-        name = catalog.database.images.put(content)
-        os.utime(catalog.image_path(name), (0, 0))
-        assert collect_garbage(catalog, dry_run=True).files == 1
-        catalog.database.images.put(content)
-        assert collect_garbage(catalog).files == 0

@@ -35,17 +35,14 @@ class TestBundles:
         assert model(other) == model(full)
         assert pictures(other) == pictures(full)
 
-    def test_unfinished_enrollment_is_not_exported(self, full: Catalog, tmp_path: Path) -> None:
+    def test_unfinished_or_abandoned_enrollment_is_not_exported(self, full: Catalog, tmp_path: Path) -> None:
         with pytest.raises(CatalogError, match="'cup' is unfinished"):
             write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["tin", "cup"]))
-        assert not (tmp_path / "a.rigcat.zip").exists()
-
-    def test_abandoned_enrollment_is_to_be_begun_again(self, full: Catalog, tmp_path: Path) -> None:
         full.resume("cup", provenance=PROVENANCE).abandon()
         with pytest.raises(CatalogError, match="'cup' was abandoned") as error:
             write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["cup"]))
         assert error.value.steps == (Do.ENROLL(name="cup"),)
-        full.begin("cup", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
+        assert not (tmp_path / "a.rigcat.zip").exists()
 
     def test_bundle_contains_the_named_objects(self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path) -> None:
         write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["tin", "Tässe =2+2"]))
