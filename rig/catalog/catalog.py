@@ -232,7 +232,6 @@ class Catalog(AbstractContextManager["Catalog"]):
                 next_step="Plan other views.",
             )
         texts = checked_texts(label, note)
-        png = None if empty_table is None else images.encode(empty_table)
         now = self.clock.utc()
         with self.writing() as found:
             known = found.named(name)
@@ -258,7 +257,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 status=EnrollmentStatus.IN_PROGRESS,
                 details={"enrollment_id": enrollment.id, "views": len(plan), "replace": replace},
             )
-            return self._start_session(found.transaction, enrollment, name, provenance, png)
+            return self._start_session(found.transaction, enrollment, name, provenance, empty_table)
 
     def resumable(self, name: str) -> EnrollmentState | None:
         """Return the unfinished enrollment of an object, or None.
@@ -276,12 +275,11 @@ class Catalog(AbstractContextManager["Catalog"]):
         Raises `ObjectNotFound`: there is no object of that name. `CatalogError`: it has no unfinished enrollment, or
         storing fails.
         """
-        png = None if empty_table is None else images.encode(empty_table)
         with self.writing() as found:
             known = found.find(name)
             enrollment, name = found.unfinished(known).enrollment, str(known.object_name)
             found.append(self.clock, Action.ENROLLMENT_RESUMED, name, details={"enrollment_id": enrollment.id})
-            return self._start_session(found.transaction, enrollment, name, provenance, png)
+            return self._start_session(found.transaction, enrollment, name, provenance, empty_table)
 
     # Change objects
 
@@ -350,17 +348,10 @@ class Catalog(AbstractContextManager["Catalog"]):
         enrollment: Enrollment,
         name: str,
         provenance: Provenance,
-        empty_table: bytes | None,
+        empty_table: NDArray[np.uint8] | None,
     ) -> "OpenEnrollment":
         # While this process may write, no other one removes the image as garbage before its row is there.
-        image = None if empty_table is None else self.database.images.put(empty_table)
-        session = Session(
-            number=len(enrollment.sessions),
-            started_utc=self.clock.utc(),
-            provenance=provenance,
-            empty_table=image,
-            empty_table_bytes=None if empty_table is None else len(empty_table),
-        )
+        session = new_session(self, len(enrollment.sessions), provenance, empty_table)
         session.enrollment_id = enrollment.id
         session.digest = digest_of(session, enrollment.key)
         transaction.add(session)
@@ -501,6 +492,21 @@ class OpenEnrollment:
                 next_step="Start a new one.",
             )
         return known
+
+
+def new_session(
+    catalog: Catalog, number: int, provenance: Provenance, empty_table: NDArray[np.uint8] | None
+) -> Session:
+    """Return the row of a session that begins now, and store its sheet of empty-table images."""
+    png = None if empty_table is None else images.encode(empty_table)
+    with catalog.database.catalog_errors():
+        return Session(
+            number=number,
+            started_utc=catalog.clock.utc(),
+            provenance=provenance,
+            empty_table=None if png is None else catalog.database.images.put(png),
+            empty_table_bytes=None if png is None else len(png),
+        )
 
 
 def store_image(

@@ -17,7 +17,7 @@ from typing import Any, Final
 from sqlalchemy import select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import sessions
+from rig.catalog import derived
 from rig.catalog.catalog import Catalog
 from rig.catalog.database import properties
 from rig.catalog.facts import Property
@@ -134,7 +134,7 @@ def update_copy(catalog: Catalog) -> bool:
         with Catalog.open(Path(folder, place.copy_folder.name), clock=clock) as made:
             made.database.images = _NoImages(made.path)
             finished(transfer(CatalogSource(catalog), made, once=True))
-            newest = sessions.empty_tables(made).newest
+            newest = derived.empty_tables(made).newest
             with suppress(CatalogError):  # rig catalog verify reports it
                 if newest is not None:
                     Images(made.path).put(catalog.database.images.content(newest))

@@ -149,12 +149,6 @@ def waiting(place: CatalogPlace, clock: Clock) -> int:
         return len(state.State(transaction).used()) + (answers or 0)
 
 
-def discard(journal: Catalog, name: str) -> None:
-    """Remove an object from the journal without delivering it. Errors as for `Catalog.delete`."""
-    journal.delete(name)
-    collect_garbage(journal)
-
-
 # Delivery
 
 

@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.catalog.catalog import Catalog, store_image
+from rig.catalog.catalog import Catalog, new_session, store_image
 from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Session, View
 from rig.catalog.records import EnrollmentStatus, Provenance
@@ -23,7 +23,6 @@ from rig.catalog.state import EnrollmentState, ending
 from rig.catalog.transfer import add_rows, digest, same_session, same_view
 from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
-from rig.views import image_files
 
 
 @dataclass(eq=False)
@@ -75,17 +74,7 @@ class Retake:
                 f"All views of {name!r} are to be taken again, so nothing shows that it stands as before.",
                 next_step=Do.ENROLL_AGAIN(name=name),
             )
-        png = None if empty_table is None else image_files.encode(empty_table)
-        with catalog.database.catalog_errors():
-            image = None if png is None else catalog.database.images.put(png)
-        session = Session(
-            number=len(former.sessions),
-            started_utc=catalog.clock.utc(),
-            provenance=provenance,
-            empty_table=image,
-            empty_table_bytes=None if png is None else len(png),
-        )
-        return cls(catalog, name, former, wanted, session)
+        return cls(catalog, name, former, wanted, new_session(catalog, len(former.sessions), provenance, empty_table))
 
     def add(self, view: View, image_bgr: NDArray[np.uint8], encoded: Future[bytes] | None = None) -> View:
         """Store the image of a view, as `OpenEnrollment.add`; the view itself waits for `finish`."""

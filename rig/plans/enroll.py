@@ -24,8 +24,8 @@ from hbr.model import symmetry
 from hbr.model.views import Views
 from rig.bench import Bench
 from rig.catalog import Catalog, OpenEnrollment, Provenance, View
+from rig.catalog.derived import camera_settings_of
 from rig.catalog.retake import Retake
-from rig.catalog.sessions import camera_settings_of
 from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded, NoObject, ObjectMoved, ObjectNotFound, RigError, RotationDisagreement
 from rig.core.json_form import plain

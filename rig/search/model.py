@@ -18,7 +18,7 @@ import hbr
 from hbr.dense.arc import ArcSession
 from hbr.paper.hmm import PoseModel
 from rig.bench import Bench
-from rig.catalog import Catalog, derived, sessions
+from rig.catalog import Catalog, derived
 from rig.catalog.copying import Attempts, update_copy
 from rig.catalog.jobs import JobProgress
 from rig.config import RigConfig
@@ -129,13 +129,13 @@ def load_model(
     notes: tuple[Note, ...] = ()
     if copied is not None:
         notes = (Note(NoteCode.LOCAL_COPY, {"copied_utc": f"{copied:%Y-%m-%d %H:%M:%S} UTC"}),)
-    camera = tuple(sessions.camera_settings(catalog))
+    camera = tuple(derived.camera_settings(catalog))
     model = Model(_index(views), notes, camera=camera)
     if not model.is_dense:
         return model
     # Views are compared only with views that were described in the same way, so the majority decides whether the
     # search uses an empty-table image.
-    before = sessions.empty_tables(catalog)
+    before = derived.empty_tables(catalog)
     with_image = len(before.with_image) >= len(before.without_image)
     others = before.without_image if with_image else before.with_image
     if others:

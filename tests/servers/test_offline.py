@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import text
 from typer.testing import Result
 
-from rig.catalog import Catalog, derived, sessions
+from rig.catalog import Catalog, derived
 from rig.catalog.copying import open_copy, open_or_copy, update_copy
 from rig.catalog.jobs import finished
 from rig.catalog.journal import Journal, deliver, journal_folder, waiting
@@ -74,7 +74,7 @@ def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace) -> None
         assert update_copy(catalog)
         with same_copy(place, catalog) as copy:
             assert derived.views(copy).object_names == ("cup", "tin")
-            assert copy.database.images.names() == {sessions.empty_tables(catalog).newest}
+            assert copy.database.images.names() == {derived.empty_tables(catalog).newest}
         expected = derived.views(catalog)
         catalog.delete("cup")
         assert update_copy(catalog)

@@ -23,7 +23,7 @@ from rig.catalog.describing import described, silhouette
 from rig.catalog.exchange.new_files import new_folder
 from rig.catalog.facts import Session, View
 from rig.catalog.images import Images, path_of
-from rig.catalog.jobs import JobProgress, portions, processes
+from rig.catalog.jobs import JobProgress, processes
 from rig.catalog.records import this_software
 from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.config.catalog_place import DATABASE_NAME
@@ -112,9 +112,9 @@ def write_training(
                 pictures.setdefault(view.image, _Picture(len(pictures), *own))
         # Find the objects in the images, in processes.
         masks: dict[int, _Mask] = {}
-        work, left = partial(_masks, made), portions(pictures.values())
-        for portion, of_these in map_in_processes(work, left, processes(jobs, len(pictures))):
-            masks.update(zip((picture.id for picture in portion), of_these, strict=True))
+        work = partial(_mask, Images(made))
+        for picture, mask in map_in_processes(work, pictures.values(), processes(jobs, len(pictures))):
+            masks[picture.id] = mask
             yield JobProgress(len(masks), len(pictures))
         # Write the annotations, in the order of the catalog.
         parts: dict[str, list[_Annotated]] = {part: [] for part in PARTS}
@@ -131,13 +131,8 @@ def write_training(
 # Masks
 
 
-def _masks(folder: Path, portion: tuple[_Picture, ...]) -> list[_Mask]:
-    """Return where the objects are in images of the catalog in a folder. Runs in a worker process."""
-    images = Images(folder)
-    return [_mask(images, picture) for picture in portion]
-
-
 def _mask(images: Images, picture: _Picture) -> _Mask:
+    """Return where the object is in a picture. Runs in a worker process."""
     whole, found = silhouette(images, picture.view, picture.session, json.loads(picture.segmentation))
     height, width = whole.shape
     x0, y0, *_ = picture.view.region or (0, 0)

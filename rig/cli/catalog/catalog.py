@@ -10,7 +10,6 @@ from rig.catalog import ObjectDetails
 from rig.catalog.describing import Described, described
 from rig.catalog.images import path_of
 from rig.catalog.journal import Journal, deliver_journal, delivery_words
-from rig.catalog.journal import discard as discard_object
 from rig.catalog.upkeep import collect_garbage
 from rig.catalog.verify import verify as verify_job
 from rig.cli.ui.command import Group
@@ -290,7 +289,7 @@ def deliver(
             if rename is not None:
                 journal.rename(*rename)
             if discard is not None:
-                discard_object(journal, discard)
+                journal.delete(discard)  # and the delivery removes it
     done = deliver_journal(place, SystemClock(), replacing=replace or ())
     for one in done:
         print(f"{'' if one.conflict is None else 'Note: '}{delivery_words(one, place)}", file=sys.stderr)

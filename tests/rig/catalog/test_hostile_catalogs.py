@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from typer.testing import Result
 
-from rig.catalog import Action, Catalog, derived, sessions
+from rig.catalog import Action, Catalog, derived
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.facts import Enrollment, Entry, Session, View, digested, sha256_of
 from rig.catalog.images import path_of
@@ -143,8 +143,8 @@ def move(catalog: Catalog, folder: Path) -> None:
 
 def answer(catalog: Catalog, _: Path) -> None:
     derived.views(catalog, BENCH_DESCRIPTOR)
-    sessions.camera_settings(catalog)
-    sessions.empty_tables(catalog)
+    derived.camera_settings(catalog)
+    derived.empty_tables(catalog)
     derived.described_regions(catalog, "bench-1")
     derived.local_views(catalog, "mug", [0.0])
 
@@ -457,7 +457,7 @@ SHOWN: dict[str, Callable[[Catalog], Any]] = {
     "identify": lambda catalog: (
         derived.views(catalog, BENCH_DESCRIPTOR).object_names,
         derived.views(catalog, BENCH_DESCRIPTOR).azimuth_deg.tolist(),
-        sessions.empty_tables(catalog).newest,
+        derived.empty_tables(catalog).newest,
     ),
     "export": lambda catalog: ascii(
         [

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from rig.catalog import Catalog
-from rig.catalog.derived import views
+from rig.catalog.derived import empty_tables, views
 from rig.catalog.exchange.photographs import read_folder, read_table
 from rig.catalog.incoming import ImportProblem
-from rig.catalog.sessions import empty_tables
 from rig.catalog.transfer import Conflict
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected, UsageError
