@@ -1,7 +1,6 @@
 """Comparison of the digests of many rows, as the database stores them: without making objects of them."""
 
-from collections.abc import Collection, Iterator, Mapping
-from functools import lru_cache
+from collections.abc import Iterator, Mapping
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, Final
@@ -13,50 +12,27 @@ from sqlalchemy import (
     DateTime,
     Float,
     Integer,
-    Select,
     Text,
-    bindparam,
     cast,
     func,
     select,
     type_coerce,
 )
 from sqlalchemy.orm import Session as Transaction
-from sqlalchemy.orm import aliased
 from sqlalchemy.types import NullType
 
 from rig.catalog.columns import stored_type
-from rig.catalog.facts import Enrollment, Entry, Row, Session, View, digested, sha256_of
+from rig.catalog.facts import Enrollment, Row, Session, View, digested, sha256_of
 from rig.catalog.jobs import portions
 
 AT_ONCE: Final = 100
 """Enrollments whose rows are in memory at once."""
 
 
-def wrong_lines(transaction: Transaction, ids: Collection[int]) -> list[int]:
-    """Return which of these lines of the log are not as they were written after the line before each."""
-    wrong: list[int] = []
-    statement = _lines(_is_postgres(transaction))
-    for part in portions(sorted(ids), 500):
-        rows = transaction.execute(statement, {"ids": part})
-        wrong += [row[0] for row in rows if row[1] != sha256_of(row[2:])]
-    return wrong
-
-
-@lru_cache(maxsize=2)  # each view that is enrolled asks it, and to build the statement takes longer than to execute it
-def _lines(is_postgres: bool) -> Select[Any]:
-    before = aliased(Entry, name="before")
-    return (
-        select(Entry.id, Entry.digest, func.coalesce(before.digest, ""), *_raw(is_postgres, Entry))
-        .outerjoin(before, before.id == Entry.id - 1)
-        .where(Entry.id.in_(bindparam("ids", expanding=True)))
-    )
-
-
 def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None]) -> Iterator[int]:
     """Yield which of these enrollments, by their ids and seals, are not as they were written."""
     enrollments, views = Enrollment.__table__.c, View.__table__.c
-    is_postgres = _is_postgres(transaction)
+    is_postgres = transaction.get_bind().dialect.name == "postgresql"
     for part in portions(sorted(seals), AT_ONCE):
         own = {
             row[0]: row[1:]
@@ -82,10 +58,6 @@ def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None
                         wrong.add(number)
         wrong |= {number for number in own if seals[number] not in (None, sha256_of(tuple(digests[number])))}
         yield from sorted(wrong)
-
-
-def _is_postgres(transaction: Transaction) -> bool:
-    return transaction.get_bind().dialect.name == "postgresql"
 
 
 def _raw(is_postgres: bool, table: type[Row]) -> list[ColumnElement[Any]]:

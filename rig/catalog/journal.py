@@ -268,7 +268,7 @@ def _deliver_answers(journal: Catalog, server: Catalog) -> None:
             return
         with_corrections = Entry.result.in_(select(Entry.result).where(is_waiting))
         entries = reading.scalars(select(Entry).where(with_corrections).order_by(Entry.id)).all()
-        state.check_lines(reading, [one.id for one in entries])
+        state.check_lines(reading, entries)
         reading.expunge_all()
     for image in {(one.record or {}).get("image") for one in entries if one.id in waiting} - {None}:
         try:

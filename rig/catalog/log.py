@@ -7,7 +7,7 @@ import os
 import pwd
 import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import datetime
@@ -16,9 +16,9 @@ from typing import Any, Final, NamedTuple
 from sqlalchemy import func, insert, select, update
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import digests
 from rig.catalog.columns import damaged
 from rig.catalog.facts import Action, Entry, Property, digest_of
+from rig.catalog.jobs import portions
 from rig.catalog.records import as_json, this_software
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged
@@ -121,18 +121,29 @@ def check_complete(transaction: Transaction) -> None:
         )
 
 
-def wrong_lines(transaction: Transaction) -> Iterator[int]:
-    """Yield the numbers of lines that are not as they were written, or that follow missing ones."""
+def wrong_lines(transaction: Transaction, lines: Iterable[Entry]) -> list[Entry]:
+    """Return which of these lines are not as they were written after the line before each."""
+    wrong: list[Entry] = []
+    for part in portions(lines, 500):
+        numbers = [line.id - 1 for line in part]
+        before = dict(transaction.execute(select(Entry.id, Entry.digest).where(Entry.id.in_(numbers))).all())
+        wrong += [line for line in part if line.digest != digest_of(line, before.get(line.id - 1, ""))]
+    return wrong
+
+
+def damaged_numbers(transaction: Transaction) -> Iterator[tuple[int, str | None]]:
+    """Yield the numbers of lines that are missing or not as they were written, with the names of their objects."""
     end, digest = head(transaction)
     for start in range(1, end + 1, 1000):
         numbers = range(start, min(start + 1000, end + 1))
-        present = set(transaction.scalars(select(Entry.id).where(Entry.id >= numbers[0], Entry.id <= numbers[-1])))
-        wrong = set(digests.wrong_lines(transaction, present))
-        yield from (number for number in numbers if number in wrong or number not in present)
+        lines = transaction.scalars(select(Entry).where(Entry.id >= numbers[0], Entry.id <= numbers[-1])).all()
+        names = {line.id: line.object_name for line in lines}
+        wrong = {line.id for line in wrong_lines(transaction, lines)} | (set(numbers) - names.keys())
+        yield from ((number, names.get(number)) for number in sorted(wrong))
     newest = transaction.scalar(select(Entry.digest).where(Entry.id == end)) or ""
     beyond = transaction.scalar(select(func.max(Entry.id))) or 0
     if newest != digest or beyond > end:
-        yield max(end, beyond)
+        yield max(end, beyond), None
 
 
 def shown(entry: Entry) -> dict[str, Any]:

@@ -5,7 +5,7 @@ says which these are.
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from difflib import get_close_matches
@@ -113,7 +113,7 @@ class State:
     def check(self) -> None:
         """Raise `CatalogDamaged` if a line of the state is missing or not as it was written."""
         log.check_complete(self.transaction)
-        check_lines(self.transaction, {line.id for line in (*self.objects.values(), *self.statuses.values())})
+        check_lines(self.transaction, (*self.objects.values(), *self.statuses.values()))
 
     def in_use(self) -> list[Entry]:
         """Return the states of the objects in use, unchecked."""
@@ -161,7 +161,7 @@ class State:
         return self._checked(found)
 
     def _checked(self, line: Entry) -> Entry:
-        check_lines(self.transaction, [line.id])
+        check_lines(self.transaction, [line])
         return line
 
     def id_of(self, known: Entry | None) -> int:
@@ -260,7 +260,7 @@ class State:
         )
         rows = self.transaction.scalars(wanted).all()
         endings = [self.statuses.get(one.id) for one in rows]
-        check_lines(self.transaction, [line.id for line in endings if line is not None])
+        check_lines(self.transaction, filter(None, endings))
         wrong = self.damaged_enrollments([one.id for one in rows]) if rows else {}
         found = []
         for enrollment, ended in zip(rows, endings, strict=True):
@@ -367,10 +367,10 @@ class State:
         self.used()
 
 
-def check_lines(transaction: Transaction, ids: Collection[int]) -> None:
+def check_lines(transaction: Transaction, lines: Iterable[Entry]) -> None:
     """Raise `CatalogDamaged` if one of these lines of the log is not as it was written."""
-    if wrong := digests.wrong_lines(transaction, ids):
-        raise changed(list(map(str, transaction.scalars(select(Entry.object_name).where(Entry.id.in_(wrong[:20]))))))
+    if wrong := log.wrong_lines(transaction, lines):
+        raise changed([str(line.object_name) for line in wrong])
 
 
 def changed(names: Sequence[str]) -> CatalogDamaged:

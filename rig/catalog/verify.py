@@ -4,7 +4,6 @@ Decision: docs/decisions/0009.
 """
 
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -125,10 +124,7 @@ def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgres
 
 
 def _lines(transaction: Transaction) -> Iterator[CatalogFinding]:
-    for number in log.wrong_lines(transaction):
-        name = None
-        with suppress(CatalogDamaged):  # the name itself may be damaged
-            name = transaction.scalar(select(Entry.object_name).where(Entry.id == number))
+    for number, name in log.damaged_numbers(transaction):
         yield CatalogFinding(CatalogProblem.LOG_CHANGED, name, details={"entry_id": number})
     log.check_complete(transaction)  # its error is one more finding
 
