@@ -132,7 +132,7 @@ def _entries(transaction: Transaction, catalog: Catalog, views: Views, image: st
 def _describe(catalog: Catalog, views: Views) -> None:
     """Store descriptors that differ from object to object, as if the images did."""
     with catalog.database.write() as transaction:
-        for j, one in enumerate(state.State(transaction).used()):
+        for j, one in enumerate(state.State(transaction, catalog.clock).used()):
             own = views.of(j)
             for kind in (descriptor(PAPER_DESCRIPTOR), descriptor(BENCH_DESCRIPTOR)):
                 packed = _rotating(kind.size_bytes, VIEWS_OF_AN_OBJECT, j)

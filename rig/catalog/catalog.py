@@ -101,13 +101,13 @@ class Catalog(AbstractContextManager["Catalog"]):
     def reading(self) -> Iterator[State]:
         """Yield the state of the catalog; for the other modules of this package, as ``database``."""
         with self.database.read() as transaction:
-            yield State(transaction)
+            yield State(transaction, self.clock)
 
     @contextmanager
     def writing(self) -> Iterator[State]:
         """Yield the state of the catalog before a change. An exception undoes the change."""
         with self.database.write() as transaction:
-            yield State(transaction)
+            yield State(transaction, self.clock)
 
     # What is enrolled
 
@@ -238,7 +238,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             if known is not None:
                 if not replace:
                     found.check_not_enrolled(known)
-                found.end_current(self.clock, known, EnrollmentStatus.IN_PROGRESS)
+                found.end_current(known, EnrollmentStatus.IN_PROGRESS)
             object_id = found.id_of(known)
             # The enrollment, its digest, and the line of the log are one fact: all are written, or none.
             enrollment = Enrollment(
@@ -249,7 +249,6 @@ class Catalog(AbstractContextManager["Catalog"]):
             found.transaction.flush()
             changed = state.new_columns(now, texts) if known is None else state.columns(known, texts) if texts else {}
             found.append(
-                self.clock,
                 Action.ENROLLMENT_STARTED,
                 name,
                 **{**changed, "object_id": object_id},
@@ -278,7 +277,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.writing() as found:
             known = found.find(name)
             enrollment, name = found.unfinished(known).enrollment, str(known.object_name)
-            found.append(self.clock, Action.ENROLLMENT_RESUMED, name, details={"enrollment_id": enrollment.id})
+            found.append(Action.ENROLLMENT_RESUMED, name, details={"enrollment_id": enrollment.id})
             return self._start_session(found.transaction, enrollment, name, provenance, empty_table)
 
     # Change objects
@@ -296,7 +295,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 return
             found.check_free(new_name)
             before = {"before": known.object_name}
-            found.append(self.clock, Action.RENAMED, new_name, **state.columns(known), details=before)
+            found.append(Action.RENAMED, new_name, **state.columns(known), details=before)
 
     def set_texts(self, name: str, *, label: str | None = None, note: str | None = None) -> None:
         """Change the label and the note of an object. None leaves them unchanged.
@@ -308,7 +307,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             known = found.find(name)
             if texts:
                 columns = state.columns(known, texts)
-                found.append(self.clock, Action.LABELLED, known.object_name, **columns, details=texts)
+                found.append(Action.LABELLED, known.object_name, **columns, details=texts)
 
     def delete(self, *names: str) -> None:
         """Delete objects, all or none. `undelete` restores them until `collect_garbage` removes them.
@@ -317,7 +316,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         with self.writing() as found:
             for known in map(found.find, dict.fromkeys(names)):
-                found.append(self.clock, Action.DELETED, known.object_name, **state.columns(known, deleted=True))
+                found.append(Action.DELETED, known.object_name, **state.columns(known, deleted=True))
 
     def undelete(self, name: str) -> None:
         """Restore the object that was deleted last under this name.
@@ -328,7 +327,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.writing() as found:
             known = found.find(name, deleted=True)
             found.check_free(str(known.object_name))
-            found.append(self.clock, Action.UNDELETED, known.object_name, **state.columns(known))
+            found.append(Action.UNDELETED, known.object_name, **state.columns(known))
 
     # The log
 
@@ -443,14 +442,14 @@ class OpenEnrollment:
         described(database, enrollment, self.object_name, held=self._held)
         with self.catalog.writing() as found:
             known = self._check_in_progress(found)
-            found.end_current(clock, known, EnrollmentStatus.COMPLETE)
+            found.end_current(known, EnrollmentStatus.COMPLETE)
             done = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, clock.utc())
-            found.append(clock, Action.ENROLLED, known.object_name, **state.ending(done))
+            found.append(Action.ENROLLED, known.object_name, **state.ending(done))
 
     def abandon(self) -> None:
         """Abandon the enrollment. Its images stay, and the complete enrollment before it stays in use."""
         with self.catalog.writing() as found:
-            found.end_current(self.catalog.clock, self._check_in_progress(found), EnrollmentStatus.IN_PROGRESS)
+            found.end_current(self._check_in_progress(found), EnrollmentStatus.IN_PROGRESS)
 
     def discard(self) -> None:
         """Remove an enrollment without views; an object that has no other enrollment goes with it.
@@ -469,7 +468,7 @@ class OpenEnrollment:
             others = transaction.scalar(select(Enrollment.id).where(Enrollment.object_id == known.object_id).limit(1))
             gone = state.columns(known, deleted=True) if others is None else {}
             own = {"enrollment_id": self.id}
-            found.append(self.catalog.clock, Action.ENROLLMENT_DISCARDED, known.object_name, **gone, **own, details=own)
+            found.append(Action.ENROLLMENT_DISCARDED, known.object_name, **gone, **own, details=own)
 
     def _missing(self, transaction: Transaction) -> tuple[int, ...]:
         present = set(transaction.scalars(select(View.index).where(View.enrollment_id == self.id)))

@@ -23,7 +23,6 @@ from rig.catalog.database import properties
 from rig.catalog.facts import Property
 from rig.catalog.images import Images
 from rig.catalog.jobs import finished
-from rig.catalog.state import State
 from rig.catalog.transfer import CatalogSource, transfer
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
@@ -120,8 +119,8 @@ def update_copy(catalog: Catalog) -> bool:
     cannot be used.
     """
     place, clock = catalog.place, catalog.clock
-    with catalog.database.read() as transaction:
-        about = {"catalog": str(place), "id": properties(transaction)["id"], "version": State(transaction).version()}
+    with catalog.reading() as state:
+        about = {"catalog": str(place), "id": properties(state.transaction)["id"], "version": state.version()}
     is_same = False
     with suppress(CatalogError), open_copy(place, clock) as copy, copy.database.read() as transaction:
         is_same = about.items() <= _about(transaction).items() and copy.version() == about["version"]

@@ -141,12 +141,9 @@ def waiting(place: CatalogPlace, clock: Clock) -> int:
     """Return how many objects and answers of the journal wait for the server."""
     if place.url is None or not CatalogPlace(journal_folder(place)).database_file.exists():
         return 0
-    with (
-        Catalog.open(journal_folder(place), clock=clock, read_only=True) as journal,
-        journal.database.read() as transaction,
-    ):
-        answers = transaction.scalar(select(func.count()).where(_is_waiting(transaction)))
-        return len(state.State(transaction).used()) + (answers or 0)
+    with Catalog.open(journal_folder(place), clock=clock, read_only=True) as journal, journal.reading() as found:
+        answers = found.transaction.scalar(select(func.count()).where(_is_waiting(found.transaction)))
+        return len(found.used()) + (answers or 0)
 
 
 # Delivery
@@ -250,7 +247,7 @@ def _forget(journal: Catalog, name: str, key: str) -> None:
         complete = found.of_status(known, EnrollmentStatus.COMPLETE)
         again = found.of_status(known, EnrollmentStatus.IN_PROGRESS) is not None
         if not again and complete is not None and complete.enrollment.key == key:
-            found.append(journal.clock, Action.DELETED, name, **state.columns(known, deleted=True))
+            found.append(Action.DELETED, name, **state.columns(known, deleted=True))
 
 
 def _is_waiting(transaction: Transaction) -> ColumnElement[bool]:

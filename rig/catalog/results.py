@@ -24,7 +24,6 @@ from rig.catalog.columns import damaged, image_name
 from rig.catalog.facts import Action, Entry
 from rig.catalog.images import path_of
 from rig.catalog.records import JsonObject, Provenance, RecordedOutcome, as_json
-from rig.catalog.state import State
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
@@ -274,10 +273,11 @@ def correct(
     operator = _operator(operator)
     if unknown and object_name is not None:
         raise UsageError("--object and --unknown are both given.", next_step="Give one of them.")
-    with catalog.database.write() as transaction:
+    with catalog.writing() as state:
+        transaction = state.transaction
         now = before = _find(transaction, result_id).current
         if object_name is not None:
-            right = State(transaction).find(object_name).object_name
+            right = state.find(object_name).object_name
             now = now._replace(outcome=RecordedOutcome.FOUND, object_name=right)
         if unknown:
             now = now._replace(outcome=RecordedOutcome.UNKNOWN, object_name=None)

@@ -114,7 +114,7 @@ class Retake:
                 if database.images.size(view.image) != len(png):  # `collect_garbage` removed it
                     database.images.put(png)
             add_rows(before.transaction, new, former.object_id)
-            before.end_current(clock, known, EnrollmentStatus.COMPLETE)
+            before.end_current(known, EnrollmentStatus.COMPLETE)
             columns = ending(EnrollmentState(new, EnrollmentStatus.COMPLETE, clock.utc()))
             columns["details"] |= {"taken_again": list(self.indices)}
-            before.append(clock, Action.ENROLLED, known.object_name, **columns)
+            before.append(Action.ENROLLED, known.object_name, **columns)

@@ -105,8 +105,8 @@ class State:
     are as they are stored: a method compares those that it uses with their digests, unless it says otherwise.
     """
 
-    def __init__(self, transaction: Transaction) -> None:
-        self.transaction = transaction
+    def __init__(self, transaction: Transaction, clock: Clock) -> None:
+        self.transaction, self._clock = transaction, clock
         self.objects: dict[int | None, Entry] = {line.object_id: line for line in transaction.scalars(_STATES)}
         self.statuses: dict[int | None, Entry] = {line.enrollment_id: line for line in transaction.scalars(_STATUSES)}
 
@@ -168,9 +168,9 @@ class State:
         """Return the id of an object; for None that of the one which the next line of the log adds."""
         return known.object_id if known and known.object_id else log.head(self.transaction)[0] + 1
 
-    def append(self, clock: Clock, action: Action, object_name: str | None, **columns: Any) -> None:
+    def append(self, action: Action, object_name: str | None = None, **columns: Any) -> None:
         """Add a line to the log; this state stays as it was before."""
-        log.append(self.transaction, clock, action, object_name, **columns)
+        log.append(self.transaction, self._clock, action, object_name, **columns)
 
     def check_free(self, name: str) -> None:
         """Raise `ObjectExists` if an object in use has this name."""
@@ -310,13 +310,13 @@ class State:
                 ),
             )
 
-    def end_current(self, clock: Clock, known: Entry, status: EnrollmentStatus) -> None:
+    def end_current(self, known: Entry, status: EnrollmentStatus) -> None:
         """End the enrollment of an object that is complete or in progress, if there is one: another replaces it."""
         before = self.of_status(known, status)
         if before is not None:
             ended, action = CURRENT[status]
-            one = replace(before, status=ended, finished_utc=before.finished_utc or clock.utc())
-            self.append(clock, action, known.object_name, **ending(one))
+            one = replace(before, status=ended, finished_utc=before.finished_utc or self._clock.utc())
+            self.append(action, known.object_name, **ending(one))
 
     # Damage
 

@@ -24,7 +24,6 @@ from rig.catalog.incoming import Read, ReadImages, RejectedFile, checked, images
 from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
 from rig.catalog.state import EnrollmentState, State, ending, new_columns
-from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 
@@ -218,10 +217,10 @@ def transfer(
                         raise _rejection(source, [content])
                     store.put(content)
             if plan.wanted:
-                new = _add(state, target.clock, plan, label)
+                new = _add(state, plan, label)
                 details: dict[str, Any] = {"origin": source.origin, "objects": plan.names, "views": plan.views}
                 details["replaced"] = list(plan.replaced)
-                state.append(target.clock, Action.IMPORTED, None, details=details)
+                state.append(Action.IMPORTED, None, details=details)
                 rows = [
                     describing.row_of(seal_of(enrollment), what, content)
                     for name, enrollment in new.items()
@@ -373,7 +372,7 @@ class _Plan:
 # Add
 
 
-def _add(state: State, clock: Clock, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
+def _add(state: State, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
     """Add the rows of objects, and a line of the log for each enrollment; return the new ones by name."""
     new = {}
     for item in plan.wanted:
@@ -387,11 +386,11 @@ def _add(state: State, clock: Clock, plan: _Plan, label: str | None) -> dict[str
                 digest(enrollment, secrets.token_hex(32))
             new[item.name] = add_rows(state.transaction, enrollment, object_id)
         if known is not None:
-            state.end_current(clock, known, EnrollmentStatus.COMPLETE)
+            state.end_current(known, EnrollmentStatus.COMPLETE)
         columns = ending(EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, item.finished_utc))
         if known is None:
             columns |= new_columns(item.created_utc, {"label": item.label or label or "", "note": item.note})
-        state.append(clock, Action.IMPORTED, item.name, **columns)
+        state.append(Action.IMPORTED, item.name, **columns)
     return new
 
 

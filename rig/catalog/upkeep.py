@@ -10,11 +10,11 @@ from typing import Final
 from sqlalchemy import delete, func, null, select, union_all
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View
 from rig.catalog.jobs import portions
 from rig.catalog.records import EnrollmentStatus
+from rig.catalog.state import COLLECTED, State
 from rig.core.errors import CatalogBusy
 from rig.core.next_steps import Do
 
@@ -51,9 +51,9 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     # listed before the rows: an image whose row is committed in the meantime is named.
     with database.catalog_errors():
         listed = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)
-    with database.read() as transaction:
-        unused = _unused(transaction, old=old)
-        images = transaction.execute(select(NAMED_IMAGES)).all()
+    with catalog.reading() as state:
+        unused = _unused(state, old=old)
+        images = state.transaction.execute(select(NAMED_IMAGES)).all()
     ids = unused.keys()
     deleted = tuple({owner.id: str(owner.object_name) for owner in unused.values() if owner.deleted}.values())
     named = {row.image for row in images if row.enrollment_id not in ids}
@@ -65,15 +65,13 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     collected = GarbageReport(deleted, len(ids), views, len(sizes), sum(sizes.values()))
     if dry_run or not (ids or sizes):
         return collected
-    with database.write() as transaction:
-        if not ids <= _unused(transaction, old=old).keys():
+    with catalog.writing() as state:
+        if not ids <= _unused(state, old=old).keys():
             raise CatalogBusy(
                 "Another process restored a deleted object meanwhile. Nothing was removed.", next_step=Do.RUN_AGAIN()
             )
-        _remove_rows(transaction, ids)
-        log.append(
-            transaction,
-            catalog.clock,
+        _remove_rows(state.transaction, ids)
+        state.append(
             Action.GARBAGE_COLLECTED,
             details={
                 "objects": list(deleted),
@@ -81,7 +79,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
                 "views": views,
                 "freed_bytes": collected.bytes,
             },
-            record={state.COLLECTED: sorted(ids)},
+            record={COLLECTED: sorted(ids)},
         )
     # What another process names meanwhile stays. One that names an image later looks for it, and stores it again.
     for part in portions(sorted(sizes), _AT_ONCE):
@@ -106,14 +104,12 @@ NAMED_IMAGES: Final = union_all(
 """Every image that a row names, with its enrollment, view and size. A result may have none."""
 
 
-def _unused(transaction: Transaction, *, old: bool) -> dict[int, Entry]:
+def _unused(state: State, *, old: bool) -> dict[int, Entry]:
     """Return the states of the objects of enrollments that can be removed, by the ids of the enrollments."""
-    found = state.State(transaction)
     unused = {}
-    for number, object_id in transaction.execute(
-        select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.object_id)
-    ):
-        owner, ended = found.objects.get(object_id), found.statuses.get(number)
+    rows = select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.object_id)
+    for number, object_id in state.transaction.execute(rows):
+        owner, ended = state.objects.get(object_id), state.statuses.get(number)
         if owner and ended and (owner.deleted or (old and ended.status in _OLD)):
             unused[number] = owner
     return unused

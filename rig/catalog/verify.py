@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import func, or_, select
-from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import describing, log
 from rig.catalog.catalog import Catalog
@@ -97,19 +96,20 @@ class _RequiredImage(NamedTuple):
 def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgress, None, CatalogVerification]:
     """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core."""
     findings, of_images, required = list[CatalogFinding](), list[CatalogFinding](), list[_RequiredImage]()
-    with catalog.database.read() as transaction:
+    with catalog.reading() as state:
+        transaction = state.transaction
         objects = transaction.scalar(select(func.count(Enrollment.object_id.distinct()))) or 0
         views = transaction.scalar(select(func.count(View.id))) or 0
         results = transaction.scalar(select(func.max(Entry.result))) or 0
         damages = dict.fromkeys(catalog.database.damage(transaction))  # in their order, each once
         for check in (_lines, _enrollments, _derived):
             try:
-                findings += check(transaction)
+                findings += check(state)
             except CatalogDamaged as damage:  # a row that cannot be read
                 damages[damage.what] = None
         changed = {one.details["enrollment_id"] for one in findings if one.problem is CatalogProblem.ENROLLMENT_CHANGED}
         try:
-            required = _images(transaction, changed)
+            required = _images(state, changed)
         except CatalogDamaged as damage:
             damages[damage.what] = None
     yield JobProgress(0, len(required))
@@ -123,40 +123,37 @@ def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgres
     return CatalogVerification(objects, views, results, image_bytes, (*damaged, *findings, *of_images))
 
 
-def _lines(transaction: Transaction) -> Iterator[CatalogFinding]:
-    for number, name in log.damaged_numbers(transaction):
+def _lines(state: State) -> Iterator[CatalogFinding]:
+    for number, name in log.damaged_numbers(state.transaction):
         yield CatalogFinding(CatalogProblem.LOG_CHANGED, name, details={"entry_id": number})
-    log.check_complete(transaction)  # its error is one more finding
+    log.check_complete(state.transaction)  # its error is one more finding
 
 
-def _enrollments(transaction: Transaction) -> Iterator[CatalogFinding]:
-    found = State(transaction)
-    for number, name in found.missing_enrollments().items():
+def _enrollments(state: State) -> Iterator[CatalogFinding]:
+    for number, name in state.missing_enrollments().items():
         yield CatalogFinding(CatalogProblem.MISSING_ENROLLMENT, name, details={"enrollment_id": number})
-    for number, name in found.damaged_enrollments().items():
+    for number, name in state.damaged_enrollments().items():
         yield CatalogFinding(CatalogProblem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number})
 
 
-def _derived(transaction: Transaction) -> Iterator[CatalogFinding]:
+def _derived(state: State) -> Iterator[CatalogFinding]:
     columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.content, Derived.sha256)
-    rows = transaction.execute(columns.order_by(Derived.seal, Derived.what).execution_options(yield_per=100))
+    rows = state.transaction.execute(columns.order_by(Derived.seal, Derived.what).execution_options(yield_per=100))
     wrong = [row[:2] for row in rows if None in row or describing.digest_of(*row[:4]) != row[4]]
-    found = State(transaction)
-    owners = {line.seal: found.objects.get(line.object_id) for line in found.statuses.values()}
+    owners = {line.seal: state.objects.get(line.object_id) for line in state.statuses.values()}
     names = {seal: owner.object_name for seal, owner in owners.items() if owner is not None}
     for seal, what in sorted(wrong, key=lambda one: names.get(one[0]) or ""):
         yield CatalogFinding(CatalogProblem.DESCRIPTION_DAMAGED, names.get(seal), details={"descriptor": what})
 
 
-def _images(transaction: Transaction, changed: Collection[int]) -> list[_RequiredImage]:
+def _images(state: State, changed: Collection[int]) -> list[_RequiredImage]:
     """Return the images of the enrollments that are not ``changed``, and of the results."""
-    state = State(transaction)
-    owners = dict(transaction.execute(select(Enrollment.id, Enrollment.object_id)).all())
+    owners = dict(state.transaction.execute(select(Enrollment.id, Enrollment.object_id)).all())
     named = select(_IMAGE.enrollment_id, _IMAGE.view_id, _IMAGE.image, _IMAGE.image_bytes).where(
         _IMAGE.image.is_not(None), or_(_IMAGE.enrollment_id.is_(None), _IMAGE.enrollment_id.not_in(changed))
     )
     found = []
-    for enrollment_id, *image in transaction.execute(named):
+    for enrollment_id, *image in state.transaction.execute(named):
         owner = state.objects.get(owners.get(enrollment_id))
         found.append(_RequiredImage(None if owner is None else owner.object_name, *image))
     return found

@@ -11,7 +11,7 @@ from sqlalchemy import func, select
 
 from hbr.core.angles import wrap180
 from rig.bench import Bench
-from rig.catalog import Catalog, Enrollment, View, derived, state
+from rig.catalog import Catalog, Enrollment, View, derived
 from rig.config import load_config
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
@@ -198,9 +198,9 @@ def check_stored(
 
 def newest_views(catalog: Catalog) -> Sequence[View]:
     """Return the views of the newest enrollment, complete or not."""
-    with catalog.database.read() as transaction:
-        newest = transaction.scalar(select(func.max(Enrollment.id)))
-        found = state.State(transaction).enrollments(Enrollment.id == newest)
+    with catalog.reading() as state:
+        newest = state.transaction.scalar(select(func.max(Enrollment.id)))
+        found = state.enrollments(Enrollment.id == newest)
         return found[0].enrollment.views if found else ()
 
 

@@ -13,7 +13,6 @@ from rig.catalog import Action, Catalog, derived
 from rig.catalog.facts import Derived
 from rig.catalog.results import find_result
 from rig.catalog.results import record as record_result
-from rig.catalog.state import State
 from rig.catalog.upkeep import YOUNG_S, collect_garbage
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
@@ -150,9 +149,9 @@ class TestGarbage:
         fill(catalog, "tin", 1, 10)
         catalog.delete("mug")
         collect_garbage(catalog)
-        with catalog.database.read() as transaction:
-            left = {one.seal for one in State(transaction).used()}
-            assert set(transaction.scalars(select(Derived.seal))) == left
+        with catalog.reading() as state:
+            left = {one.seal for one in state.used()}
+            assert set(state.transaction.scalars(select(Derived.seal))) == left
         assert len(left) == 1
 
     def test_image_that_no_row_names_is_kept_for_a_day(self, catalog: Catalog, clock: VirtualClock) -> None:
