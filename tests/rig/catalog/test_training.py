@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 from rig.catalog import Catalog, Provenance, View
 from rig.catalog.describing import described
-from rig.catalog.exchange.training import Annotations, write_training
+from rig.catalog.exchange.training import Annotations, TrainingExport, write_training
 from rig.catalog.transfer import CatalogSource
 from rig.catalog.verify import verify
 from rig.cli.main import app
 from rig.core.errors import ExportFailed
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, without_waiting
+from tests.rig.catalog.exchange.exchange_samples import facts
 
 REGION = (16, 0, 160, 144)
 VIEWS = 4
@@ -69,18 +70,26 @@ def catalog(sample: Path) -> Iterator[Catalog]:
         yield opened
 
 
-def export(catalog: Catalog, folder: Path, form: Annotations = Annotations.COCO, **options: Any) -> Any:
-    return finished(write_training(folder, CatalogSource(catalog), form, jobs=1, **options))
+@pytest.fixture(scope="module")
+def coco(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainingExport]:
+    folder = tmp_path_factory.mktemp("coco") / "out"
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(sample, clock=VirtualClock(), read_only=True) as opened:
+        without_waiting(patch)
+        return folder, export(opened, folder)
+
+
+def export(catalog: Catalog, folder: Path, form: Annotations = Annotations.COCO) -> TrainingExport:
+    return finished(write_training(folder, CatalogSource(catalog), form, jobs=1))
 
 
 def parts_of(folder: Path) -> dict[str, Any]:
     return {path.stem.partition("_")[2]: json.loads(path.read_text()) for path in (folder / "annotations").iterdir()}
 
 
-def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path) -> None:
-    done = export(catalog, tmp_path / "out")
+def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, coco: tuple[Path, TrainingExport]) -> None:
+    folder, done = coco
     assert (done.objects, done.views, done.without_mask) == (2, {"train": 2 * VIEWS, "val": 0, "test": 0}, 1)
-    content = parts_of(tmp_path / "out")["train"]
+    content = parts_of(folder)["train"]
     assert [(one["name"], one["supercategory"]) for one in content["categories"]] == [
         ("mug", "toys"),
         ('tin: "7"', "toys"),
@@ -91,7 +100,7 @@ def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path
         assert found.complete is not None
         views += zip(found.views, described(catalog.database, found.complete, name).segmentation, strict=True)
     for (view, evidence), picture, annotation in zip(views, content["images"], content["annotations"], strict=True):
-        assert (tmp_path / "out" / picture["file_name"]).read_bytes() == catalog.image_path(view.image).read_bytes()
+        assert (folder / picture["file_name"]).read_bytes() == catalog.image_path(view.image).read_bytes()
         assert picture["azimuth_deg"] == annotation["azimuth_deg"] == view.azimuth_deg
         assert (picture["width"], picture["height"]) == (192, 144)
         stored = evidence["box_px"]
@@ -104,14 +113,13 @@ def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
-def test_pycocotools_reads_the_masks(catalog: Catalog, tmp_path: Path) -> None:
-    coco = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
-    export(catalog, tmp_path / "out")
-    read = coco.COCO(tmp_path / "out" / "annotations" / "instances_train.json")
+def test_pycocotools_reads_the_masks(coco: tuple[Path, TrainingExport]) -> None:
+    reader = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
+    read = reader.COCO(coco[0] / "annotations" / "instances_train.json")
     for annotation in read.loadAnns(read.getAnnIds(iscrowd=False)):
         mask = read.annToMask(annotation)
         (picture,) = read.loadImgs(annotation["image_id"])
-        frame = cv2.imread(str(tmp_path / "out" / picture["file_name"]))
+        frame = cv2.imread(str(coco[0] / picture["file_name"]))
         really = np.abs(frame.astype(int) - 128).max(axis=2) > 30
         assert (mask & really).sum() / (mask | really).sum() > 0.9
         x, y, width, height = annotation["bbox"]
@@ -120,24 +128,14 @@ def test_pycocotools_reads_the_masks(catalog: Catalog, tmp_path: Path) -> None:
     assert len(read.getAnnIds(iscrowd=True)) == 1
 
 
-def contents(catalog: Catalog) -> list[object]:
-    found = [catalog.object(item.name) for item in catalog.objects()]
-    return [
-        (one.summary, [(e.enrollment.key, e.status, e.finished_utc, e.seal) for e in one.enrollments]) for one in found
-    ]
-
-
-def import_(folder: Path, catalog: Path) -> Result:
-    return CliRunner().invoke(app, ["import", str(folder), "--bench", "sim", "--set", f"catalog.path={catalog}"])
-
-
-@pytest.mark.parametrize("form", Annotations)
-def test_import_restores_everything(catalog: Catalog, tmp_path: Path, form: Annotations) -> None:
-    export(catalog, tmp_path / "out", form)
-    done = import_(tmp_path / "out", tmp_path / "new")
+def test_import_restores_everything(catalog: Catalog, coco: tuple[Path, TrainingExport], tmp_path: Path) -> None:
+    words = ["import", str(coco[0]), "--bench", "sim", "--set", f"catalog.path={tmp_path / 'new'}"]
+    done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     with Catalog.open(tmp_path / "new", clock=VirtualClock()) as new:
-        assert contents(new) == contents(catalog)
+        assert [facts(one) for one in CatalogSource(new).items()] == [
+            facts(one) for one in CatalogSource(catalog).items()
+        ]
         assert finished(verify(new)).findings == ()
 
 
