@@ -23,7 +23,7 @@ import hbr
 from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog, OpenEnrollment
 from rig.catalog.copying import Attempts, open_copy, open_or_copy
-from rig.catalog.facts import Action, Enrollment, Entry
+from rig.catalog.facts import Action, Entry
 from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.records import EnrollmentStatus, JsonObject
 from rig.catalog.state import ObjectSummary
@@ -209,17 +209,20 @@ def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) ->
     try:
         enrollment = journal.object(name).complete
         assert enrollment is not None
-        conflict = Conflict.REPLACE if replaces or _replaces(journal, enrollment) else Conflict.REJECT
-        finished(transfer(CatalogSource(journal, [name]), server, conflict=conflict, once=True, jobs=1))
+        with journal.database.read() as transaction:  # did it begin with the wish to replace a known object?
+            lines = select(Entry.details).where(
+                Entry.enrollment_id == enrollment.id, Entry.action == Action.ENROLLMENT_STARTED
+            )
+            replaces |= any(details.get("replace") for details in transaction.scalars(lines))
+        conflict = Conflict.REPLACE if replaces else Conflict.REJECT
+        finished(transfer(CatalogSource(journal, [name]), server, conflict=conflict, once=True))
     except ObjectExists:
         return ObjectExists(
             f"The journal has {name!r}, and the catalog has another object of that name. Nothing is lost.",
             next_step=(
                 Do.DELIVER_RENAMED(name=name),
-                "Or",
-                Do.DELIVER_REPLACING(name=name),
-                "Or",
-                Do.DISCARD(name=name),
+                *("Or", Do.DELIVER_REPLACING(name=name)),
+                *("Or", Do.DISCARD(name=name)),
             ),
         )
     except (CatalogDamaged, ObjectNotFound) as error:
@@ -227,27 +230,14 @@ def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) ->
             return error
         fix = ("Restore them from a backup, or", Do.DISCARD(name=name), "Then enroll the object again.")
         return CatalogDamaged(error.what, next_step=fix, evidence=error.evidence)
-    _forget(journal, name, enrollment.key)
-    return None
-
-
-def _replaces(journal: Catalog, enrollment: Enrollment) -> bool:
-    """Return whether an enrollment began with the wish to replace that of a known object."""
-    with journal.database.read() as transaction:
-        begun = transaction.scalars(
-            select(Entry.details).where(Entry.enrollment_id == enrollment.id, Entry.action == Action.ENROLLMENT_STARTED)
-        )
-        return any(details.get("replace") for details in begun)
-
-
-def _forget(journal: Catalog, name: str, key: str) -> None:
-    """Remove a delivered object from the journal, unless it has been or is being enrolled again."""
     with journal.writing() as found:
         known = found.find(name)
         complete = found.of_status(known, EnrollmentStatus.COMPLETE)
-        again = found.of_status(known, EnrollmentStatus.IN_PROGRESS) is not None
-        if not again and complete is not None and complete.enrollment.key == key:
+        # It may have been enrolled again meanwhile, or be enrolled again now.
+        is_same = complete is not None and complete.enrollment.key == enrollment.key
+        if is_same and found.of_status(known, EnrollmentStatus.IN_PROGRESS) is None:
             found.append(Action.DELETED, name, **state.columns(known, deleted=True))
+    return None
 
 
 def _is_waiting(transaction: Transaction) -> ColumnElement[bool]:
