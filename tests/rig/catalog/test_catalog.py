@@ -190,9 +190,10 @@ def test_unknown_name_suggests_similar_names(catalog: Catalog, asked: str, known
 
 
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "a\x00b", "\ud800", "x" * 101])
-def test_begin_rejects_invalid_names_and_texts(catalog: Catalog, name: str) -> None:
-    with pytest.raises(UsageError):
-        begin(catalog, name)
+def test_begin_rejects_invalid_names_texts_and_plans(catalog: Catalog, name: str) -> None:
+    for words, azimuths_deg in ((name, [0.0]), ("mug", []), ("mug", [360.0])):
+        with pytest.raises(UsageError):
+            catalog.begin(words, planned_azimuth_deg=azimuths_deg, provenance=PROVENANCE)
     with pytest.raises(UsageError, match="label"):
         begin(catalog, "mug", label="\udcff")
     with pytest.raises(UsageError, match="control characters"):
@@ -234,13 +235,6 @@ def test_add_accepts_numpy_scalars(catalog: Catalog) -> None:
     stored = catalog.object("mug").views[0]
     assert stored.evidence == {"locked": True, "gain": 0.5}
     assert (stored.azimuth_deg, stored.captured_ns, stored.imu_deg, stored.imu_sigma_deg) == (0.5, 7, 2.0, 1.0)
-
-
-def test_impossible_plans_are_rejected(catalog: Catalog) -> None:
-    with pytest.raises(UsageError):
-        begin(catalog, "bowl", 0)
-    with pytest.raises(UsageError):
-        catalog.begin("bowl", planned_azimuth_deg=[360.0], provenance=PROVENANCE)
 
 
 class CatalogMachine(RuleBasedStateMachine):
