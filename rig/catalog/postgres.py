@@ -5,7 +5,7 @@ Decision: docs/decisions/0011.
 
 from typing import Final
 
-from sqlalchemy import DDL, Connection, Engine, QueuePool, create_engine, event, func, insert, select, text
+from sqlalchemy import DDL, Connection, Engine, QueuePool, create_engine, event, func, insert, inspect, select, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
@@ -122,10 +122,7 @@ def limit_idle(connection: Connection, seconds: int) -> None:
 
 
 def _has_tables(connection: Connection) -> bool:
-    # to_regclass may answer from a cache of the session
-    here = "relnamespace = CAST(current_schema() AS regnamespace)"
-    found = f"SELECT count(*) FROM pg_class WHERE relname = :name AND {here}"
-    return bool(connection.execute(text(found), {"name": Property.__tablename__}).scalar())
+    return inspect(connection).has_table(Property.__tablename__)
 
 
 def _engine(place: CatalogPlace, busy_timeout_s: float) -> Engine:
