@@ -1,5 +1,6 @@
 """A catalog from an untrusted sender cannot reach outside its folder, and every change of its database is noticed."""
 
+import json
 import os
 import random
 import shutil
@@ -17,7 +18,7 @@ from typer.testing import Result
 from rig.catalog import Action, Catalog, derived
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.facts import Enrollment, Entry, Session, View, digested, sha256_of
-from rig.catalog.images import path_of
+from rig.catalog.images import name_of, path_of
 from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
 from rig.catalog.transfer import CatalogSource, transfer
@@ -515,6 +516,25 @@ def test_an_edited_state_is_not_written_again(root: Path) -> None:
         with opened(root) as catalog, pytest.raises(CatalogDamaged, match="'mug'") as error:
             change(catalog)
         assert Do.VERIFY_CATALOG() in error.value.steps
+
+
+@pytest.mark.parametrize("words", [("list",), ("list", "--label", ""), ("list", "--deleted")])
+def test_listing_reports_a_flipped_byte_of_a_view_and_is_printed(
+    rig: Callable[..., Result], root: Path, words: tuple[str, ...]
+) -> None:
+    intact = rig("catalog", *words)
+    assert intact.exit_code == 0, intact.output
+    with closing(sqlite3.connect(root / "catalog.sqlite")) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    stored, name = (root / "catalog.sqlite").read_bytes(), name_of(images.encode(image(10))).encode()
+    (root / "catalog.sqlite").write_bytes(stored.replace(name, name[:-1] + bytes([name[-1] ^ 1])))
+    done = rig("catalog", *words)
+    assert done.exit_code == 7
+    assert done.stdout == intact.stdout
+    assert "Error 707 (catalog damaged): 'mug' in the catalog changed" in done.stderr
+    listed, error = map(json.loads, rig("catalog", *words, "--json").stdout.splitlines())
+    assert listed
+    assert error["code"] == 707
 
 
 def test_damage_stays_noticed_after_later_changes(root: Path) -> None:
