@@ -47,7 +47,7 @@ class Database(ABC):
     def read(self) -> Iterator[Transaction]:
         """Yield a transaction that sees the catalog as it is at its first query."""
         with self.catalog_errors(), self._reads.begin() as connection:
-            self._begin(connection, writes=False)
+            self._begin(connection)
             with _transaction(connection) as transaction:
                 yield transaction
 
@@ -57,7 +57,7 @@ class Database(ABC):
         if self.read_only:
             raise CatalogError(f"The catalog {self.place} is open for reading only.", next_step="Open it for writing.")
         with self.catalog_errors(), self._writes.begin() as connection:
-            self._begin(connection, writes=True)
+            self._begin(connection)
             with _transaction(connection) as transaction:
                 yield transaction
                 transaction.flush()
@@ -79,8 +79,8 @@ class Database(ABC):
         """Check the database; ``create`` it if there is none."""
 
     @abstractmethod
-    def _begin(self, connection: Connection, *, writes: bool) -> None:
-        """Begin a transaction: one that ``writes`` waits until no other one does."""
+    def _begin(self, connection: Connection) -> None:
+        """Begin a transaction, as the option ``begin`` of its engine says: one that writes waits for the others."""
 
     def damage(self, transaction: Transaction) -> list[str]:  # noqa: ARG002 - a server checks its own pages
         """Return what the database's own check of its structure finds."""

@@ -19,8 +19,8 @@ from rig.core.next_steps import Do
 _CREATION: Final = 0x48425200
 """Lock of the creation of the tables."""
 
-_CATALOG: Final = f"CAST(CAST('{Property.__tablename__}' AS regclass) AS bigint)"
-"""Lock of a catalog."""
+_LOCK: Final = f"SELECT pg_advisory_xact_lock(CAST(CAST('{Property.__tablename__}' AS regclass) AS bigint))"
+"""Takes the lock of a catalog."""
 
 for _fact in FACTS:  # a program that changes a fact in place fails
     _table = _fact.__tablename__
@@ -66,14 +66,14 @@ class PostgresDatabase(Database):
         engine = _engine(place, self._busy_timeout_s)
         return (
             engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True),
-            engine.execution_options(isolation_level="READ COMMITTED"),
+            engine.execution_options(isolation_level="READ COMMITTED", begin=_LOCK),
         )
 
-    def _begin(self, connection: Connection, *, writes: bool) -> None:
-        if writes:
+    def _begin(self, connection: Connection) -> None:
+        if lock := connection.get_execution_options().get("begin"):
             # The transaction sees what was committed before it got the lock: each query has a snapshot of its own.
             limit_idle(connection, LOST_BENCH_S)
-            connection.execute(text(f"SELECT pg_advisory_xact_lock({_CATALOG})"))
+            connection.execute(text(lock))
         check_properties(properties(connection), self.place)
 
     def _open(self, *, create: bool) -> None:

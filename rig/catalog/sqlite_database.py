@@ -54,10 +54,10 @@ class SqliteDatabase(Database):
     def _engines(self) -> tuple[Engine, Engine]:
         pool = QueuePool(self._connect, dialect=_dialect())  # type: ignore[arg-type] # typeshed: no DBAPIConnection
         engine = Engine(pool, _dialect(), _URL, execution_options={"compiled_cache": _COMPILED})
-        return engine, engine
+        return engine, engine.execution_options(begin="BEGIN IMMEDIATE")
 
-    def _begin(self, connection: Connection, *, writes: bool) -> None:
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+    def _begin(self, connection: Connection) -> None:
+        connection.exec_driver_sql(connection.get_execution_options().get("begin", "BEGIN"))
 
     def _open(self, *, create: bool) -> None:
         if not self.place.database_file.exists():
