@@ -67,10 +67,9 @@ class DeviceFile:
 
 @dataclass(frozen=True, slots=True)
 class SerialPort(DeviceFile):
-    """A serial port; ``latency_ms`` is the adapter's latency timer (in `latency_file`), None if it has none."""
+    """A serial port; ``latency_ms`` is the adapter's latency timer, None if it has none."""
 
     latency_ms: int | None
-    latency_file: str
     usb: Mapping[str, str]
 
 
@@ -127,15 +126,13 @@ class Computer:
                 continue
             if entry.name.startswith("ttyS") and device.resolve().parent.name.startswith("serial8250"):
                 continue  # reserved by the kernel, without hardware
-            latency_file = f"/sys/bus/usb-serial/devices/{entry.name}/latency_timer"
-            latency = self._text(latency_file)
+            latency = self._text(f"/sys/bus/usb-serial/devices/{entry.name}/latency_timer")
             usb = self._usb(device)
             name = " ".join(usb[key] for key in ("manufacturer", "product") if usb.get(key)) or "serial port"
             ports.append(
                 SerialPort(
                     **self._node(f"/dev/{entry.name}", name, "dev/serial/by-id"),
                     latency_ms=int(latency) if latency.isdigit() else None,
-                    latency_file=latency_file,
                     usb=usb,
                 )
             )
@@ -159,7 +156,7 @@ class Computer:
             return known
         node = self._node(path, "not an adapter of this computer", "")
         node["holders"] = ()  # a pseudo-terminal is always open in the program at its other end
-        return SerialPort(**node, latency_ms=None, latency_file="", usb={})
+        return SerialPort(**node, latency_ms=None, usb={})
 
     def i2c_buses(self, configured: int | str | None = None) -> list[DeviceFile]:
         """Return the I2C buses for sensors, and the configured one; not those of monitors, memory and clock chips."""

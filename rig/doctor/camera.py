@@ -1,7 +1,7 @@
 """Check the camera: its mode, its locks, and the age and quality of its frames."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import asdict
 from typing import Any
 
@@ -57,21 +57,17 @@ def open_camera(context: DoctorContext, *, refocus: bool = False) -> OpenCvCamer
     device = context.computer.camera_device(source)
     state = FileStore(context.config.state_path(context.bench))
     settings = camera_settings(context.config, state, device)
-    with ExitStack() as failed:
-        failed.callback(capture.release)
+    try:
         if refocus:
             settings = settings.model_copy(update={"focus": None})
             capture.set(cv2.CAP_PROP_AUTOFOCUS, 1)
-        camera = OpenCvCamera(
-            capture,
-            clock=context.computer.clock,
-            settings=settings,
-            name=f"camera {source}",
-            device=device,
-        )
+        name, clock = f"camera {source}", context.computer.clock
+        camera = OpenCvCamera(capture, clock=clock, settings=settings, name=name, device=device)
         if refocus:
             store_focus(state, device, camera.read_locks().focus)
-        failed.pop_all()
+    except BaseException:
+        capture.release()
+        raise
     return camera
 
 

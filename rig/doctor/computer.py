@@ -129,9 +129,7 @@ def _latency(context: DoctorContext, port: SerialPort) -> Finding:
     text = "latency timer of {path} is {latency_ms} ms"
     if (port.latency_ms or 0) <= LATENCY_MS:
         return fine("latency", text, **now)
-    fix, permanently = f"echo {LATENCY_MS} | sudo tee {port.latency_file}", context.step(Do.UDEV_RULES()).command
-    text += ": each reading waits for it (permanently: {permanently})"
-    return warning("high_latency", text, fix, permanently=permanently, **now)
+    return warning("high_latency", f"{text}: each reading waits for it", udev_command(context), **now)
 
 
 def disk(context: DoctorContext) -> Iterator[Finding]:

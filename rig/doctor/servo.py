@@ -14,6 +14,7 @@ from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.registers import control_table, servo_plugin
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
+from rig.doctor.computer import LATENCY_MS, udev_command
 from rig.doctor.examination import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, graded, warning
 from rig.doctor.servo_scan import BAUD_RATES, BaudScan, scan_servos
@@ -161,9 +162,8 @@ def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Finding:
     text = "{readings} readings of {reading_ms:.1f} ms each, {retries} repeated"
     if again <= REPEATED and each_ms > SLOW * 1e3 * context.config.table.poll_s:
         port = context.computer.serial_port(context.config.servo.port)
-        fix = Do.SERVO_BAUD(baud=1000000)
-        if port and (port.latency_ms or 0) > 1:
-            fix = f"echo 1 | sudo tee {port.latency_file}"
+        has_timer = port is not None and (port.latency_ms or 0) > LATENCY_MS
+        fix = udev_command(context) if has_timer else Do.SERVO_BAUD(baud=1000000)
         return warning("slow_readings", f"{text}: slow", fix, **quality)
     fix = "Check the plugs of the servo's cable"
     return graded("readings", text, fix, is_warning=again > REPEATED, **quality)

@@ -286,21 +286,20 @@ def single_servo(context: DoctorContext) -> Iterator[SingleServo]:
 
 
 def _only_one(scans: list[BaudScan], port: str) -> FoundServo:
-    unplug = "Unplug all other servos, then try again."
-    if scans and (ids := scans[-1].duplicate_ids):
-        raise SeveralServos(
-            f"Two servos answer at once to id {', '.join(map(str, ids))} at {scans[-1].baud} baud.",
-            next_step=unplug,
-            evidence={"ids": list(ids), "baud": scans[-1].baud},
-        )
+    ids = list(scans[-1].duplicate_ids) if scans else []
     found = [servo for scan in scans for servo in scan.servos]
+    if ids or len(found) > 1:
+        several = f"There are {len(found)} servos on {port}."
+        twice = f"Two servos answer at once to id {', '.join(map(str, ids))} at {scans[-1].baud} baud."
+        raise SeveralServos(
+            twice if ids else several,
+            next_step="Unplug all other servos, then try again.",
+            evidence={"ids": ids, "servos": list(map(str, found))},
+        )
     if not found:
         raise DeviceNotFound(
             f"No servo answers on {port} at any baud rate.",
             next_step="Check the servo's cable and switch on its supply (its LED blinks once), then try again.",
             evidence={"port": port},
         )
-    if len(found) > 1:
-        evidence = {"servos": list(map(str, found))}
-        raise SeveralServos(f"There are {len(found)} servos on {port}.", next_step=unplug, evidence=evidence)
     return found[0]
