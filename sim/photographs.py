@@ -25,7 +25,7 @@ from sim.world import SimObject, World
 
 NAME = "photographs"
 _SECTION = f"bench.{NAME}"
-_VIEWS = (4, 720)  # of `rig.config.EnrollConfig`
+_VIEWS = (4, 720)  # of `rig.config.schema.EnrollConfig`
 _SHOWN = 3
 _KEPT = 16  # decoded photographs: a move goes from one to the next, and large ones take 30 MB each
 

@@ -84,6 +84,12 @@ _NO_DEVICE: Final = {
     0xFB: "a BNO055 whose registers are read at a wrong position: the bus loses clock pulses",
 }
 
+# Usual reasons for an answer from another chip.
+_ALSO_AT: Final = {
+    0x68: "the clocks DS1307 and DS3231 also have address 0x68",
+    0x28: "a BNO080 or BNO085 uses another protocol at similar addresses",
+}
+
 
 def imu_kinds() -> dict[str, ImuKind]:
     """Return all rows by key; a row of another package replaces the row with the same key.
@@ -116,4 +122,7 @@ def recognised(address: int, register: int, value: int) -> ImuKind | None:
 def likely_device(wanted: ImuKind, address: int, value: int) -> str:
     """Describe what answers in place of the sensor ``wanted``, by the value of its identity register."""
     other = recognised(address, wanted.register, value)
-    return other.name if other is not None else _NO_DEVICE.get(value, "another chip")
+    if other is not None:
+        return other.name
+    also = "".join(f"; {text}" for at, text in _ALSO_AT.items() if at in wanted.addresses)
+    return _NO_DEVICE.get(value, f"another chip{also}")
