@@ -51,10 +51,11 @@ Truth = Mapping[str, tuple[float, str]]
 
 
 @contextmanager
-def opened(seed: int, noise: NoiseModel | None = None, *settings: str) -> Iterator[tuple[Any, Any]]:
-    operator = ShelfOperator(World(noise=noise, seed=seed), shelf())
-    with open_sim_bench(load_config(None, settings), operator) as bench:
-        yield bench, operator.devices
+def opened(seed: int, **noise: float) -> Iterator[tuple[Any, Any, Optics]]:
+    """Yield a simulated bench, its devices, and the camera's true optics."""
+    operator = ShelfOperator(World(noise=NoiseModel(**noise), seed=seed), shelf())
+    with open_sim_bench(load_config(None, ()), operator) as bench:
+        yield bench, operator.devices, operator.optics
 
 
 def last(events: Iterator[Any]) -> CalibrationResult:
@@ -64,13 +65,13 @@ def last(events: Iterator[Any]) -> CalibrationResult:
 
 
 def imu_scale(seed: int) -> tuple[CalibrationResult, Truth]:
-    with opened(seed) as (bench, parts):
+    with opened(seed) as (bench, parts, _):
         part = parts.imu.inertial
         return last(GyroScale(8).live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
 
 
 def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
-    with opened(seed) as (bench, parts):
+    with opened(seed) as (bench, parts, _):
         part = parts.imu.inertial
         truth = {f"tilt_{name}": (degrees(float(part.up[i])), "°") for i, name in enumerate("xy")}
         truth |= {f"accel_zero_{name}": (float(part.accel_bias_g[i]), "g") for i, name in enumerate("xyz")}
@@ -80,12 +81,12 @@ def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
 
 def backlash(seed: int) -> tuple[CalibrationResult, Truth]:
     backlash_deg = float(np.random.default_rng(seed).uniform(0.05, 1.0))
-    with opened(seed, NoiseModel(backlash_deg=backlash_deg)) as (bench, _):
+    with opened(seed, backlash_deg=backlash_deg) as (bench, *_):
         return last(Backlash(24).live(bench)), {"backlash": (backlash_deg, "°")}
 
 
 def encoder(seed: int) -> tuple[CalibrationResult, Truth]:
-    with opened(seed, NoiseModel(encoder_harmonic_deg=0.2)) as (bench, parts):
+    with opened(seed, encoder_harmonic_deg=0.2) as (bench, parts, _):
         result = last(Encoder(2).live(bench))
         (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
         # The angle 0 of the servo is 180° from that of the shaft, so odd harmonics change their sign.
@@ -93,30 +94,27 @@ def encoder(seed: int) -> tuple[CalibrationResult, Truth]:
 
 
 def lens(seed: int) -> tuple[CalibrationResult, Truth]:
-    operator = ShelfOperator(World(noise=NoiseModel(camera_mount=1.0), seed=seed), shelf())
-    with open_sim_bench(load_config(None, ()), operator) as bench:
+    with opened(seed, camera_mount=1.0) as (bench, _, optics):
         result = last(CameraModel().live(bench))
-    optics = operator.optics
     values = (*optics.focal_px, *optics.centre_px, *optics.distortion[:4])
     return result, {name: (value, unit) for (name, unit), value in zip(camera_model.PARAMETERS, values, strict=True)}
 
 
 def axis(seed: int) -> tuple[CalibrationResult, Truth]:
-    operator = ShelfOperator(World(noise=NoiseModel(camera_mount=1.0), seed=seed), shelf())
-    with open_sim_bench(load_config(None, ()), operator) as bench:
+    with opened(seed, camera_mount=1.0) as (bench, _, optics):
         result = last(TableAxis().live(bench, last(CameraModel().live(bench))))
-    return result, axis_truth(operator.optics)
+    return result, axis_truth(optics)
 
 
 def drawn_axis(seed: int) -> tuple[CalibrationResult, Truth]:
     """Return the axis from corners that are drawn instead of found in frames: a hundred seeds take minutes."""
     rng = np.random.default_rng(seed)
     optics = Optics.drawn(rng)
-    about: Any = {"when_utc": datetime(2026, 1, 1, tzinfo=UTC), "reference": "", "operator": "", "device": {}}
+    when_utc = datetime(2026, 1, 1, tzinfo=UTC)
     seen = drawn_views(optics, tuple(STANDS), camera_model.ANGLES_DEG, rng)
-    intrinsics = camera_model.evaluate(seen, CharucoBoard(), (WIDTH, HEIGHT)).result(**about)
+    intrinsics = camera_model.evaluate(seen, CharucoBoard(), (WIDTH, HEIGHT)).result(when_utc=when_utc)
     seen = drawn_views(optics, table_axis.STANDS, table_axis.ANGLES_DEG, rng)
-    return table_axis.evaluate(seen, CharucoBoard(), intrinsics).result(**about), axis_truth(optics)
+    return table_axis.evaluate(seen, CharucoBoard(), intrinsics).result(when_utc=when_utc), axis_truth(optics)
 
 
 def drawn_views(
@@ -156,7 +154,7 @@ def axis_truth(optics: Optics) -> Truth:
 def frame_time(seed: int) -> tuple[CalibrationResult, Truth]:
     readout_ms = float(np.random.default_rng(seed).uniform(5, 25))
     noise = NoiseModel(camera_readout_ms=readout_ms)
-    with opened(seed, noise) as (bench, parts):
+    with opened(seed, camera_readout_ms=readout_ms) as (bench, parts, _):
         exposure_ms = bench.config.camera.exposure_us * 1e-3
         result = last(CameraTime("mug-star").live(bench))
         offset_ms = (exposure_ms + readout_ms) / 2 - parts.camera.times.offset_ns * 1e-6

@@ -36,7 +36,6 @@ Floats = NDArray[np.float64]
 
 TARGETS_DEG = (20.0, 6.0, 20.0, 0.0)  # a start and a stop at full acceleration, with a pause between them
 """Where the table stops in turn: each profile leaves some frequencies without ringing, so there are two distances."""
-MIN_STOPS = 4  # fewer do not show a scatter
 LISTEN_S = 2.0  # longer: more noise; shorter: the slowest ringing does not die down
 CREEPS = 2  # more: the calibration takes longer; fewer: the friction is known to 0.003° instead of 0.002°
 """How many times the table moves slowly up and down."""

@@ -12,19 +12,15 @@ from hbr.evaluation.protocol import METHODS, Protocol
 from hbr.evaluation.trials import LocalPhotographs, run_object
 from hbr.model.views import Views
 
-SIZE = (96, 96)
 
-
-def drawn(kind: int, angle_deg: float, *, sticker: bool) -> np.ndarray:
-    """Draw a cylinder with spots before a dark background; the sticker is a spot that only one twin has."""
-    image = np.zeros((*SIZE, 3), np.uint8)
-    cv2.rectangle(image, (20, 12), (76, 84), (90 + 60 * kind, 150, 200 - 50 * kind), -1)
-    rng = np.random.default_rng(kind)
-    spots = [(*rng.uniform((0, 20), (360, 76)), rng.integers(40, 255, 3).tolist(), 6) for _ in range(14)]
-    for around_deg, y, colour, radius in [*spots, *([(100.0, 48.0, [30, 30, 250], 9)] if sticker else [])]:
-        angle = np.radians(around_deg - angle_deg)
-        if np.cos(angle) > 0.2:
-            cv2.circle(image, (round(48 + 24 * np.sin(angle)), round(y)), radius, colour, -1)
+def drawn(kind: int, angle_deg: int, *, sticker: bool) -> np.ndarray:
+    """Draw an object with a texture around it, before a dark background; one twin has a sticker on it."""
+    around = np.random.default_rng(kind).integers(40, 255, (6, 24, 3)).astype(np.uint8)
+    if sticker:
+        around[2:4, 6:8] = 30, 30, 250
+    image = np.zeros((96, 96, 3), np.uint8)
+    seen = np.roll(around, -angle_deg // 15, axis=1)[:, :8]
+    image[12:84, 20:76] = cv2.resize(seen, (56, 72), interpolation=cv2.INTER_NEAREST)
     return image
 
 
