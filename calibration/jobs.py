@@ -63,6 +63,9 @@ def _titled(title: str = "") -> "Callable[[Callable[..., Sequence[Procedure]]], 
     return lambda procedures: Calibration(title, procedures)
 
 
+# The least numbers of moves in the options below: fewer do not show a scatter, in each direction where it matters.
+
+
 @_titled("Servo (minutes)")
 def servo(
     reversals: Annotated[int, typer.Option(min=6, help="Reversals for the backlash.")] = 24,
