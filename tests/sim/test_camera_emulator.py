@@ -1,7 +1,5 @@
 """The simulated camera: image formation, noise, settings, and equal bytes for equal seeds."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import pytest
@@ -81,14 +79,6 @@ def test_vignetting_darkens_the_corners_by_its_share() -> None:
     assert image[239:241, 319:321] == pytest.approx(200, abs=1)
     for corner in (image[0, 0], image[0, -1], image[-1, 0], image[-1, -1]):
         assert corner == pytest.approx(140, abs=1)
-
-
-def test_flicker_changes_the_brightness_of_whole_frames() -> None:
-    world = World(noise=QUIET.with_values(light_flicker=0.02))
-    world.put(grey(128))
-    capture = camera(world)
-    levels = np.array([frame(capture).mean() for _ in range(60)])
-    assert levels.std() / 128 == pytest.approx(0.02, rel=0.35)
 
 
 # -- noise ------------------------------------------------------------------------------------------------------------
@@ -177,15 +167,3 @@ def test_setting_acts_on_frames_exposed_after_it() -> None:
     capture.set(cv2.CAP_PROP_EXPOSURE, 50)
     assert capture.read()[1].mean() == 100  # type: ignore[union-attr]
     assert frame(capture).mean() == 50
-
-
-def test_invisible_object_is_rejected_with_a_message() -> None:
-    @dataclass(frozen=True)
-    class Ghost:
-        name: str = "ghost"
-
-    world = World(noise=QUIET)
-    capture = camera(world)
-    world.put(Ghost())
-    with pytest.raises(TypeError, match="draw"):
-        frame(capture)

@@ -1,16 +1,13 @@
 """Changes of the simulated bench: the changed properties, their size, and their seeds."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from hbr.drawing.noise import Noise
 from rig.bench import Bench
-from rig.config import RigConfig, ViewConfig
+from rig.config import RigConfig
 from rig.core.errors import UsageError
-from rig.views.capture import ImageQuality, RejectReason
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES, Change
 from sim.noise import NoiseModel
@@ -84,24 +81,3 @@ def test_papers_noise_is_that_of_the_experiments(name: str) -> None:
     else:  # other random numbers
         own, its = (np.std(image.astype(float) - before) for image in (after, expected))
         assert own == pytest.approx(its, rel=0.02)
-
-
-def test_noise_model_gives_every_frame_the_papers_noise() -> None:
-    frames = []
-    for variance in (0.0, 0.012):
-        world = World(noise=NoiseModel.none().with_values(gaussian_variance=variance), seed=1)
-        operator = ShelfOperator(world, shelf(), next_object="toy-house", yaw_deg=0.0)
-        with open_sim_bench(RigConfig(), operator) as bench:
-            operator.place(None)
-            frames.append(_frame(bench))
-    plain, noisy = frames
-    assert np.std(noisy.astype(float) - plain) > 20  # 28 grey levels, less what is clipped
-
-
-def test_limits_of_a_view_decide_about_blur_and_noise() -> None:
-    blurred = ImageQuality(sharpness=1.0, mean_level=60.0, dark_share=0.0, saturated_share=0.0, noise_share=0.0)
-    noisy = replace(blurred, sharpness=6000.0, noise_share=0.9)
-    dark = replace(noisy, mean_level=1.0)
-    usual, all_accepted = ViewConfig(), ViewConfig(min_sharpness=0.0, max_noise=1.0)
-    assert [q.reasons(usual) for q in (blurred, noisy)] == [[RejectReason.BLURRED], [RejectReason.NOISE]]
-    assert [q.reasons(all_accepted) for q in (blurred, noisy, dark)] == [[], [], [RejectReason.TOO_DARK]]

@@ -1,11 +1,9 @@
 """The virtual clock: time advances only during sleeps, and timers fire at their time and in their order."""
 
-from datetime import UTC, datetime, timedelta
-
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.clock import EPOCH, VirtualClock
+from sim.clock import VirtualClock
 from tests.fuzzing import examples
 
 quick = examples(10)
@@ -23,21 +21,6 @@ def test_timers_fire_at_their_time_in_the_order_of_scheduling(at: list[int], unt
     assert fired == sorted((t, k) for k, t in enumerate(at) if t <= until)
     assert clock.now_ns() == until
     assert clock.next_event_ns() == min((t for t in at if t > until), default=None)
-
-
-@quick
-@given(at=times, stops=st.lists(st.integers(0, 1_000), max_size=10))
-def test_number_of_time_steps_does_not_matter(at: list[int], stops: list[int]) -> None:
-    def run(steps: list[int]) -> list[int]:
-        clock = VirtualClock()
-        fired: list[int] = []
-        for t in at:
-            clock.call_at(t, lambda: fired.append(clock.now_ns()))
-        for stop in steps:
-            clock.advance_to(stop)
-        return fired
-
-    assert run([*sorted(stops), 1_000]) == run([1_000])
 
 
 @quick
@@ -74,10 +57,3 @@ def test_sleep_advances_time_by_positive_durations_only(seconds: float) -> None:
     clock = VirtualClock()
     clock.sleep(seconds)
     assert clock.now_ns() == max(round(seconds * 1e9), 0)
-
-
-def test_civil_time_starts_at_the_given_time_and_advances() -> None:
-    assert VirtualClock().utc() == EPOCH
-    clock = VirtualClock(start_utc=datetime(2024, 2, 29, 12, tzinfo=UTC))
-    clock.sleep(86_400.0)
-    assert clock.utc() - timedelta(days=1) == datetime(2024, 2, 29, 12, tzinfo=UTC)

@@ -116,13 +116,6 @@ def test_speed_is_reached_and_held(t: float, x: float, v: float, goal: float, a_
     assert position - path.at(path.end_s)[0] == pytest.approx(goal * after, abs=1e-9)
 
 
-@quick
-@given(starts, angles, st.floats(-1e4, 1e4))
-def test_rest_does_not_move(t: float, x: float, later: float) -> None:
-    position, velocity = rest(t, x).at(t + later)
-    assert (position, velocity) == (x, 0.0)
-
-
 # -- the platter ----------------------------------------------------------------------------------------------------
 
 
@@ -151,34 +144,6 @@ def test_backlash_follows_its_operator_and_stays_within_its_half(path: Piecewise
     angle = follower.at(times)
     assert np.abs(angle - shaft).max() <= play_deg / 2 + 1e-9
     assert angle == pytest.approx(play_operator(shaft, shaft[0], play_deg / 2), abs=1e-6)
-
-
-@quick
-@given(st.floats(0.01, 3), st.floats(5, 100), st.floats(5, 100))
-def test_backlash_is_a_hysteresis(play_deg: float, there: float, back: float) -> None:
-    """Coming from below the platter lags by half of the backlash, from above it leads by half."""
-    follower = platter(play_deg)
-    for k, goal in enumerate((there, there - back)):
-        x = float(follower.at(10.0 * k)) if k else 0.0
-        nxt = Platter(play_deg, 0.0, 0.0)
-        shaft = follower.shaft.at(10.0 * k)
-        nxt.follow(to_position(10.0 * k, float(shaft[0]), 0.0, goal, 50.0, 500.0), follower)
-        assert float(nxt.at(10.0 * k)) == pytest.approx(x)  # without a jump
-        follower = nxt
-        side = 1 if k else -1
-        assert float(follower.at(10.0 * k + 9.0)) == pytest.approx(goal + side * play_deg / 2)
-
-
-@quick
-@given(trajectories(), st.floats(0, 2), st.sampled_from([0.0, 8.0, 30.0]), st.integers(0, 2**32 - 1))
-def test_platter_never_jumps(path: PiecewiseMotion, play_deg: float, structure_hz: float, seed: int) -> None:
-    follower = Platter(play_deg, structure_hz, 0.15)
-    follower.follow(path, None)
-    h = 1e-5
-    t = np.random.default_rng(seed).uniform(path.start_s[0] + h, path.end_s + 0.5, 300)
-    t = np.concatenate([t, path.start_s[1:]])
-    fastest_dps = np.abs(path.at(path.start_s)[1]).max() + (1_000 if structure_hz else 0) + 0.5
-    assert np.abs(follower.at(t + h) - follower.at(t - h)).max() <= 2 * h * fastest_dps
 
 
 @quick

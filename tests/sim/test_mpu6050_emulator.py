@@ -201,22 +201,6 @@ def test_bias_scale_and_tilt_are_drawn_with_the_models_spread() -> None:
     assert np.std(np.degrees(np.arcsin(ups[:, :2]))) == pytest.approx(noise.imu_tilt_deg, rel=0.1)
 
 
-def test_bias_walks_at_the_models_pace() -> None:
-    pace = 0.1
-    drifts = []
-    for seed in range(100):
-        world = World(noise=NoiseModel.none().with_values(gyro_bias_walk_dps_rts=pace), seed=seed)
-        sensor = SimMpu6050(world)
-        for setting in ([DIV, 0, 3], [PWR, 0x01]):
-            sensor.start(reading=False)
-            sensor.write(bytes(setting))
-        for _ in range(10):
-            world.clock.sleep(0.4)
-            sensor.read(1)
-        drifts.append(sensor.inertial.gyro_bias_dps)
-    assert np.std(drifts) == pytest.approx(pace * 2, rel=0.15)
-
-
 @pytest.mark.nightly
 def test_flicker_noise_has_one_allan_deviation_at_all_times_however_it_is_read() -> None:
     floor = (0.004, 0.0, 0.001)

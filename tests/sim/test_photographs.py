@@ -95,21 +95,6 @@ def test_enrollment_takes_each_photograph_with_its_own_angle(rig: Rig) -> None:
     assert len(stored_views("obj2")) == 4
 
 
-def test_table_angles_in_the_names_run_the_other_way(rig: Rig) -> None:
-    save(Path("photographs"))
-    assert rig("enroll", "obj1", "--yes", *put(table_angles="true")).exit_code == 0
-    assert all(apart(azimuth_deg, -nearest_angle("obj1", image, 45)) < 1 for azimuth_deg, image in stored_views("obj1"))
-
-
-@pytest.mark.nightly
-def test_fault_replaces_the_object_by_another_one_of_the_photographs(rig: Rig) -> None:
-    save(Path("photographs"))
-    rig("enroll", "obj1", "--yes", *WITHOUT_NOISE, *put(faults='["object_moved:other=3:angle=0@move3"]'))
-    colours = [tuple(image[70, 50].tolist()) for _, image in stored_views("obj1")]
-    assert set(colours[:2]) == {COLOURS["obj1"]}
-    assert set(colours[4:]) == {COLOURS["obj2"]}  # the third one of the sorted names
-
-
 @pytest.mark.nightly
 def test_demo_enrolls_photographs_and_searches_in_the_others(rig: Rig) -> None:
     save(Path("photographs"), step_deg=22.5)
@@ -139,18 +124,6 @@ def test_objects_are_found_by_the_photographs_that_were_not_enrolled(rig: Rig) -
     frames = [image for image in images if image.shape[:2] == (SIZE, SIZE)]
     assert frames
     assert all(nearest_angle("obj10", frame, 22.5) % 45 == 22.5 for frame in frames)
-
-
-@pytest.mark.nightly
-def test_watch_shows_one_object_after_the_other(rig: Rig) -> None:
-    save(Path("photographs"))
-    for name in ("obj1", "obj2"):
-        assert rig("enroll", name, "--views", "4", "--yes").exit_code == 0
-
-    done = rig("identify", "--watch", "--json", *put(object='["obj2","obj1","nothing"]'))
-    events = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [event["name"] for event in events if event.get("event") == "identified"] == ["obj2", "obj1"]
-    assert "has no object 'nothing'" in done.stderr
 
 
 def test_empty_table_is_shown_from_its_image(rig: Rig) -> None:
@@ -250,13 +223,6 @@ def test_bench_without_a_source_names_the_key(rig: Rig) -> None:
     assert rig("config", "check").exit_code == 0
 
 
-def test_every_leaves_photographs_for_both(rig: Rig) -> None:
-    save(Path("photographs"))
-    done = rig("enroll", "obj1", "--yes", *put(every=8))
-    assert "obj1 has 1 photograph to enroll it with" in done.stderr
-    assert "bench.photographs.every" in done.stderr
-
-
 def test_grey_photographs_and_unused_files_do_not_disturb(rig: Rig) -> None:
     folder = save(Path("photographs"))
     for path in folder.iterdir():
@@ -265,14 +231,6 @@ def test_grey_photographs_and_unused_files_do_not_disturb(rig: Rig) -> None:
     (folder / "notes.txt").write_text("obj")
     assert rig("enroll", "obj1", "--yes").exit_code == 0
     assert "1 file of photographs not used: cover.png" in " ".join(rig("status").output.split())
-
-
-def test_region_that_is_set_must_lie_within_the_photographs(rig: Rig) -> None:
-    save(Path("photographs"))
-    assert rig("enroll", "obj1", "--yes", "--set", "view.roi=[10, 10, 80, 80]").exit_code == 0
-    done = rig("enroll", "obj2", "--yes", "--set", "view.roi=[10, 10, 100, 80]")
-    assert done.exit_code == 3
-    assert "not within the camera's frame of 100x100" in done.stderr
 
 
 @given(st.lists(st.floats(0, 359.9), min_size=1, max_size=20, unique=True), st.floats(-1000, 1000))

@@ -58,16 +58,6 @@ def test_reading_the_world_changes_nothing(moves_made: list[tuple[float, float]]
 
 @quick
 @given(moves)
-def test_table_stays_within_backlash_and_ringing(moves_made: list[tuple[float, float]]) -> None:
-    world = run(moves_made, NoiseModel(structure_hz=0.0, speed_ripple=0.0), lambda _: None)
-    t = np.arange(0, world.clock.now_ns(), 1_000_000)
-    table = world.table_angles(t)
-    shaft = np.array([world.shaft(int(when))[0] for when in t])
-    assert np.abs(table - shaft).max() <= world.noise.backlash_deg / 2 + 1e-9
-
-
-@quick
-@given(moves)
 def test_table_follows_the_shaft_without_backlash_and_ringing(moves_made: list[tuple[float, float]]) -> None:
     world = run(moves_made, perfect, lambda _: None)
     for t in np.linspace(0, world.clock.now_ns(), 50).astype(np.int64):

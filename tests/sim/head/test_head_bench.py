@@ -5,7 +5,7 @@ import pytest
 from hbr.core.angles import wrap180
 from rig.catalog import Catalog, derived
 from rig.config import load_config
-from rig.core.errors import DeviceSilent, EmergencyStop, FaultLatched, HeadRestarted, ViewRejected
+from rig.core.errors import DeviceSilent, EmergencyStop, FaultLatched, HeadRestarted
 from rig.devices.head.head import powered
 from rig.devices.head.protocol import Reset
 from rig.events.events import Accepted
@@ -97,17 +97,6 @@ def test_estop_while_the_table_rests_is_found_before_the_next_motion(on_head):
         table.goto(40.0)
     assert s.bench.safety.state is TableState.FAULT
     assert s.world.table_deg() == pytest.approx(20.0, abs=1.0)
-
-
-def test_failed_light_damages_no_view(on_head, tmp_path):
-    s = on_head("memory", "view.retakes=1")
-    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        events = enroll(s.bench, catalog, "lamp", views=8)
-        with pytest.raises(ViewRejected, match="dark"):
-            for event in events:
-                if isinstance(event, Accepted) and event.index == 2:
-                    s.bench.head.set_light(0.0)
-        assert len(derived.views(catalog).azimuth_deg) in (0, 3)
 
 
 def test_unplugged_head_ends_the_plan_and_switches_the_servo_off(on_head, tmp_path):

@@ -102,22 +102,3 @@ def undisturbed(kind: str) -> list[tuple[int, int]]:
             coming += [*h.head._coming]
             h.head.take(end_ns)
         return coming + [(c.time_ns, round(c.value)) for c in h.head.changes]
-
-
-def test_host_build_and_the_binary_measure_the_same():
-    """Only the times of the bytes differ, not the measured values."""
-    angles = {}
-    for kind in ("memory", "avr"):
-        with opened_head(kind, NoiseModel.none()) as h:
-            h.clock.sleep(0.2)
-            h.imu.read_samples()
-            h.world.drive(to_position(h.clock.now_ns() * 1e-9, 0.0, 0.0, 70.0, 90.0, 300.0))
-            rotated = 0.0
-            for _ in range(16):
-                h.clock.sleep(0.1)
-                samples = h.imu.read_samples()
-                assert samples.lost == 0
-                rotated += samples.gyro_dps[:, 2].sum() / h.imu.rate_hz
-            angles[kind] = rotated
-    assert angles["memory"] == pytest.approx(70.0, abs=0.02)
-    assert angles["avr"] == pytest.approx(angles["memory"], abs=0.01)

@@ -33,7 +33,7 @@ from sim.realtime.commands import HELP, Commands
 from sim.realtime.pace import RealTime
 from sim.realtime.run import run_bench
 from sim.realtime.server import MAX_LINE, BenchServer, ClientSession
-from sim.realtime.wire import SOCKET, Wire, send_command, short_path
+from sim.realtime.wire import SOCKET, send_command, short_path
 from sim.world import World
 from tests.contract.heads import needs
 from tests.fuzzing import fuzz_settings
@@ -354,12 +354,19 @@ def test_each_command_changes_the_world(commands):
         "faults": ["jam", "camera.off"],
     }
     assert "jam, camera.off" in commands.do(["status"])
+    with pytest.raises(UsageError, match="already there"):
+        commands.do(["jam"])
     commands.do(["end", "jam"])
     commands.do(["end"])
     commands.do(["clear"])
     assert (commands.state()["faults"], commands.state()["object"]) == ([], None)
     assert "lamp" in commands.do(["objects"]).splitlines()
     assert commands.do(["help"]) == commands.do([]) == HELP
+    servo = commands._devices.servo
+    servo.memory["Torque Enable"] = 1
+    servo._on_torque_enable()
+    with pytest.raises(UsageError, match="holds the table"):
+        commands.do(["rotate", "90"])
 
 
 @pytest.mark.parametrize(
@@ -382,29 +389,3 @@ def test_impossible_command_names_the_next_step(commands, words, step):
     with pytest.raises(UsageError) as error:
         commands.do(words)
     assert step in error.value.next_step
-
-
-def test_fault_cannot_begin_twice(commands):
-    commands.do(["jam"])
-    with pytest.raises(UsageError, match="already there"):
-        commands.do(["jam"])
-
-
-def test_held_table_cannot_be_rotated_by_hand(commands):
-    commands._devices.servo.memory["Torque Enable"] = 1
-    commands._devices.servo._on_torque_enable()
-    with pytest.raises(UsageError, match="holds the table"):
-        commands.do(["rotate", "90"])
-
-
-def test_lost_connection_is_an_error_of_the_device(tmp_path):
-    listener = socket.socket(socket.AF_UNIX)
-    with short_path(tmp_path) as path:
-        listener.bind(f"{path}/{SOCKET}")
-    listener.listen()
-    wire = Wire(tmp_path)
-    listener.accept()[0].close()
-    with pytest.raises(OSError, match=r"ended|Broken pipe|reset"):
-        wire.ask(ask="do", words=[])
-    wire.close()
-    listener.close()

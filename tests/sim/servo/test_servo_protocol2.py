@@ -75,17 +75,6 @@ def test_status_packets_equal_the_emanuals(bus_id: int, status: StatusPacket, fr
     assert status_packet(bus_id, status) == bytes.fromhex(frame)
 
 
-def unstuffed(stuffed: bytes) -> bytes:
-    """Return ``stuffed`` without the byte that follows each FF FF FD, left to right, as the e-manual has it."""
-    plain = bytearray()
-    rest = iter(stuffed)
-    for byte in rest:
-        plain.append(byte)
-        if plain.endswith(b"\xff\xff\xfd"):
-            assert next(rest) == 0xFD
-    return bytes(plain)
-
-
 @quick
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
 @example(bus_id=1, error=0, data=b"\xff\xff\xfd\xff\xfd\xfd")
@@ -93,7 +82,6 @@ def test_byte_stuffing_removes_headers_and_can_be_undone(bus_id: int, error: int
     frame = status_packet(bus_id, StatusPacket(error, data))
     assert b"\xff\xff\xfd\x00" not in frame[4:-2]
     assert SDK.updateCRC(0, frame, len(frame) - 2) == frame[-2] | frame[-1] << 8
-    assert unstuffed(frame[7:-2]) == bytes((0x55, error)) + data
     assert bytes(Packets().removeStuffing(list(frame))[7:-2]) == bytes((0x55, error)) + data
 
 
