@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
@@ -27,7 +27,7 @@ from sim.devices import SimDevices
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
 from sim.noise import NoiseModel
-from sim.objects.projection import Image, Visible
+from sim.objects.projection import Image
 from sim.objects.shelf import shelf
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
@@ -86,6 +86,8 @@ class ShelfOperator:
 
     backdrop: Image | None = None
     """See `sim.camera.SimCapture`."""
+    findings: tuple[str, ...] = ()
+    """Notes for the operator."""
 
     def __init__(
         self,
@@ -184,7 +186,6 @@ class SimShelf:
     def picture(self, name: str) -> Image:
         """Return a picture of an object on the platter, uint8 (480, 480, 3)."""
         thing, image = self._operator.thing(name, to_identify=False), empty_platter()
-        assert isinstance(thing, Visible)
         thing.draw(image, _SHOWN_DEG, (0.0, 0.0))
         return image[:, 80:560]
 
@@ -269,17 +270,6 @@ def open_sim_bench(
     return bench
 
 
-class Stage(NamedTuple):
-    """A simulated bench before it is opened.
-
-    ``operator`` returns the operator in a world, and ``findings`` are notes for the operator.
-    """
-
-    config: RigConfig
-    operator: Callable[[World], ShelfOperator]
-    findings: tuple[str, ...] = ()
-
-
 class SimBenchKind(BenchKind):
     """The kind of bench ``sim``: a simulated bench in a new world whose clock starts at the computer's time."""
 
@@ -288,26 +278,24 @@ class SimBenchKind(BenchKind):
     _camera_back_ns = 0
     """When the camera is plugged in again, on the computer's clock; a bench that is opened before has none."""
 
-    def prepare(self, config: RigConfig, options: SimOptions) -> Stage:  # noqa: ARG002
-        """Return what is on the bench."""
-        return Stage(config, partial(ShelfOperator, objects=shelf()))
+    def prepare(self, config: RigConfig, options: Any, world: World) -> tuple[RigConfig, ShelfOperator]:  # noqa: ARG002
+        """Return the bench's configuration, and the operator with what is on the bench."""
+        return config, ShelfOperator(world, shelf())
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
         assert isinstance(options, SimOptions)
-        stage = self.prepare(config, options)
         with ExitStack() as held:
             state = _state(self.name, config, held)
-            operator = stage.operator(new_world(options, seed, rest_angle_deg(config, state)))
+            config, operator = self.prepare(config, options, new_world(options, seed, rest_angle_deg(config, state)))
             operator.next_object = options.object if isinstance(options.object, str) else None
             operator.yaw_deg = options.yaw_deg
             if options.mark:
                 operator.place(HOME_MARK)
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
-            bench = open_sim_bench(
-                stage.config, operator, faults=map(Fault.parse, options.faults), open_now=(), name=self.name
-            )
-            bench.findings += stage.findings
+            faults = map(Fault.parse, options.faults)
+            bench = open_sim_bench(config, operator, faults=faults, open_now=(), name=self.name)
+            bench.findings += operator.findings
             self._keep_unplugged(operator, options)
             if options.object is None:
                 bench.shelf = SimShelf(operator, partial(self._unplug, operator, options))
@@ -329,11 +317,10 @@ class SimBenchKind(BenchKind):
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:
         """Yield the simulated computer with the faults that need no motion."""
         assert isinstance(options, SimOptions)
-        stage = self.prepare(config, options)
-        world = new_world(options, seed)
+        config, operator = self.prepare(config, options, new_world(options, seed))
         with (
-            SimDevices.connected(stage.config, world, stage.operator(world).backdrop) as devices,
-            simulated_computer(stage.config, devices) as computer,
+            SimDevices.connected(config, operator.world, operator.backdrop) as devices,
+            simulated_computer(config, devices) as computer,
         ):
             faults = Faults(devices)
             faults.schedule(*map(Fault.parse, options.faults))

@@ -21,7 +21,7 @@ from sim.calibration_board import BoardOnPlatter
 from sim.camera_controls import BUFFERS_RANGE, EXPOSURE_RANGE, KELVIN_RANGE, NOMINAL_EXPOSURE, SHARP_AT, Controls
 from sim.frame_times import FPS, FrameTimes, bands, frame_after, row_weights, start_ns
 from sim.noise import NoiseModel
-from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, WIDTH, Image, Visible
+from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, WIDTH, Image
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
 from sim.room import relight, room
@@ -143,18 +143,13 @@ class SimCapture(Capture):
         return self._plugged
 
     @property
-    def exposure(self) -> float:
-        """The exposure in force, in V4L2's unit."""
-        return self._controls[-1][1].exposure
-
-    @property
-    def kelvin(self) -> float:
-        """The white balance in force."""
-        return self._controls[-1][1].kelvin
+    def controls(self) -> Controls:
+        """The settings in force."""
+        return self._controls[-1][1]
 
     def drift(self, **values: Any) -> None:
         """Change settings (fields of `Controls`) although they are locked, as a faulty camera does."""
-        self._change(self._clock.now_ns(), replace(self._controls[-1][1], **values))
+        self._change(self._clock.now_ns(), replace(self.controls, **values))
 
     # -- interface of cv2.VideoCapture --------------------------------------------------------------------------------
 
@@ -216,14 +211,13 @@ class SimCapture(Capture):
 
     def get(self, prop: int) -> float:
         self._meter()
-        now = self._controls[-1][1]
         values: dict[int, float] = {
             cv2.CAP_PROP_FRAME_WIDTH: self._width // self._binning,
             cv2.CAP_PROP_FRAME_HEIGHT: self._height // self._binning,
             cv2.CAP_PROP_FPS: FPS,
             cv2.CAP_PROP_FOURCC: v4l2.fourcc_number(self._fourcc),
             cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else self._stamp_ns(self._grabbed) * 1e-6,
-            **now.values,
+            **self.controls.values,
         }
         if self._lost and prop not in _NO_CONTROLS:
             return -1.0
@@ -233,7 +227,7 @@ class SimCapture(Capture):
     def set(self, prop: int, value: float) -> bool:
         """Change a setting for later frames; return False for settings that the camera controls automatically."""
         self._meter()
-        now = self._controls[-1][1]
+        now = self.controls
         match prop:
             case cv2.CAP_PROP_FOURCC if value in {v4l2.fourcc_number(fourcc) for fourcc in _FOURCCS}:
                 self._fourcc = int(value).to_bytes(4, "little").decode("ascii")
@@ -260,7 +254,7 @@ class SimCapture(Capture):
         """Queue the frames that have arrived while there is room; the others are lost."""
         self._meter()
         now_ns = self._clock.now_ns()
-        room = self._controls[-1][1].buffers
+        room = self.controls.buffers
         if self.hangs:
             self._next = max(self._next, self._exposed_from(frame_after(now_ns)))
         while len(self._queue) < room and self._arrival_ns(self._next) <= now_ns:
@@ -357,8 +351,6 @@ class SimCapture(Capture):
         image = empty.copy()
         if scene.object is None:
             return self._as_mounted(image if self.visit is None else seen_on_visit(self.visit, None, table_deg))
-        if not isinstance(scene.object, Visible):
-            raise TypeError(f"{scene.object!r} is not visible: it has no method draw")
         x, y = scene.offset_mm
         c, s = cos(radians(table_deg)), sin(radians(table_deg))
         offset_mm = c * x - s * y, s * x + c * y
@@ -391,7 +383,7 @@ class SimCapture(Capture):
         while start_ns(self._metered + _METER_FRAMES) <= now_ns:
             self._metered += _METER_FRAMES
             time_ns = start_ns(self._metered)
-            controls = self._controls[-1][1]
+            controls = self.controls
             if controls.autofocus and controls.focus != SHARP_AT:
                 step = min(max(SHARP_AT - controls.focus, -_FOCUS_STEP), _FOCUS_STEP)
                 controls = replace(controls, focus=controls.focus + step)

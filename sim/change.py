@@ -82,8 +82,8 @@ class Change:
         rng, camera = devices.world.rng("another day"), devices.camera
         exposure, kelvin = rng.uniform(-1, 1, 2).tolist()
         camera.drift(
-            exposure=camera.exposure * (1 + self.exposure * exposure),
-            kelvin=camera.kelvin + self.white_balance_k * kelvin,
+            exposure=camera.controls.exposure * (1 + self.exposure * exposure),
+            kelvin=camera.controls.kelvin + self.white_balance_k * kelvin,
         )
         if self.gaussian_variance or self.motion_px:
             camera.noise = Noise(self.gaussian_variance, self.motion_px)

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,7 +19,7 @@ from rig.core.errors import ConfigError, ImportRejected, UsageError
 from rig.core.next_steps import Do
 from rig.core.phrases import counted
 from rig.views.image_files import BadImage, decode, header, read_file
-from sim.bench import ShelfOperator, SimBenchKind, SimOptions, Stage
+from sim.bench import ShelfOperator, SimBenchKind, SimOptions
 from sim.objects.projection import Floats, Image
 from sim.world import SimObject, World
 
@@ -198,6 +198,7 @@ class PhotographOperator(ShelfOperator):
         super().__init__(world, photographed.identified)
         self._photographed = photographed
         self.targets = {}
+        self.findings = photographed.findings
         self.backdrop = photographed.backdrop()
         self.clear()
 
@@ -241,14 +242,12 @@ class PhotographsKind(SimBenchKind):
 
     def fitted(self, config: RigConfig, options: Any) -> RigConfig:
         """Return the configuration for the photographs. Raises as `PhotographedObjects`."""
-        return self.prepare(config, options).config
+        return PhotographedObjects.read(options).fitted(config)
 
-    def prepare(self, config: RigConfig, options: Any) -> Stage:
-        """Return the photographs on the bench. Raises as `PhotographedObjects`."""
-        assert isinstance(options, PhotographOptions)
+    def prepare(self, config: RigConfig, options: Any, world: World) -> tuple[RigConfig, ShelfOperator]:
+        """Return the configuration for the photographs, and who shows them. Raises as `PhotographedObjects`."""
         photographed = PhotographedObjects.read(options)
-        operator = partial(PhotographOperator, photographed=photographed)
-        return Stage(photographed.fitted(config), operator, photographed.findings)
+        return photographed.fitted(config), PhotographOperator(world, photographed)
 
 
 def _size(path: Path) -> tuple[int, int]:

@@ -21,10 +21,17 @@ HISTORY_S = 12.0  # time for which the past is stored: longer than the IMU's FIF
 
 
 class SimObject(Protocol):
-    """An object that can stand on the platter. The camera draws it if it is `sim.objects.projection.Visible`."""
+    """An object that can stand on the platter."""
 
     @property
     def name(self) -> str: ...
+
+    def draw(self, image: NDArray[np.uint8], azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
+        """Draw the object into ``image``, uint8 (480, 640, 3), which shows the empty platter.
+
+        ``azimuth_deg`` is the object's counter-clockwise rotation seen from above; ``offset_mm`` is the position of its
+        axis in the room, as in `sim.objects.projection`.
+        """
 
 
 @dataclass(frozen=True, slots=True)

@@ -104,7 +104,7 @@ simulated_fault("blur", "The lens is out of focus.", pixels=Parameter(8.0, "sigm
     factor=Parameter(2.0, "new exposure divided by the old one", 0.01, 100),
 )
 def _exposure_jump(devices: SimDevices, _rng: Rng, factor: float) -> End:
-    exposure = devices.camera.exposure
+    exposure = devices.camera.controls.exposure
     devices.camera.drift(exposure=exposure * factor)
     return lambda: devices.camera.drift(exposure=exposure)
 

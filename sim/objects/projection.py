@@ -1,4 +1,4 @@
-"""The simulated camera's view of the platter: geometry, light, and the interface of visible objects.
+"""The simulated camera's view of the platter: geometry and light.
 
 Room frame, millimetres: origin at the centre of the platter's top, x to the camera's right, y away from it, z up. The
 camera stands at the front (-y), `ELEVATION_DEG` above the horizon. A counter-clockwise rotation seen from above moves
@@ -9,7 +9,6 @@ platter's centre, as through a long lens.
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import cos, hypot, radians, sin
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,21 +32,6 @@ SIN, COS = sin(radians(ELEVATION_DEG)), cos(radians(ELEVATION_DEG))
 TO_CAMERA: Floats = np.array([0.0, -COS, SIN])
 TO_LIGHT: Floats = np.array([-0.50, -0.62, 0.605]) / np.linalg.norm([-0.50, -0.62, 0.605])
 AMBIENT = 0.42  # ambient part of the light; the rest comes from the lamp at the front left
-
-
-@runtime_checkable
-class Visible(Protocol):
-    """A `sim.world.SimObject` that the simulated camera can see."""
-
-    @property
-    def name(self) -> str: ...
-
-    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
-        """Draw the object into ``image``, uint8 (480, 640, 3), which shows the empty platter.
-
-        ``azimuth_deg`` is the object's counter-clockwise rotation seen from above; ``offset_mm`` is the position of its
-        axis in the room.
-        """
 
 
 @dataclass(frozen=True, slots=True)

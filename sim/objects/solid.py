@@ -39,7 +39,7 @@ class Solid:
     """The smallest rotation after which it looks the same: 360 for none, 360 / n for n-fold, 0 for free symmetry."""
 
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Draw the object into ``image`` as `sim.objects.projection.Visible` describes."""
+        """Draw the object into ``image`` as `sim.world.SimObject` describes."""
         pose = ObjectPose(azimuth_deg, *offset_mm)
         clear, foot = self._shadow
         place(image, np.zeros_like(clear), clear, pose.to_image(np.zeros((1, 3)))[0] - foot)
