@@ -82,17 +82,26 @@ class KernelBus(AbstractContextManager["KernelBus"]):
     """
 
     def __init__(self) -> None:
+        global _kernel_ioctl
         self.kernel_drivers: set[int] = set()
         self._addressed: dict[int, int] = {}
-        self._file = RoutedFile(self)
-        self.path = self._file.path
+        self._fd: int | None = os.memfd_create("sim-i2c")  # without a name, so that a killed program leaves no file
+        self.path = f"/dev/fd/{self._fd}"
+        self._key = _file_key(os.fstat(self._fd))
+        if not _routed:
+            _kernel_ioctl, _seam.ioctl, _sysfs.adapter_name = _seam.ioctl, _routed_ioctl, _routed_name
+        _routed[self._key] = self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
         """Remove the bus; a second call does nothing."""
-        self._file.close()
+        if _routed.pop(self._key, None) and not _routed:
+            _seam.ioctl, _sysfs.adapter_name = _kernel_ioctl, _kernel_name
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
 
     @abstractmethod
     def transfer(self, messages: Messages) -> list[bytes]:
@@ -304,27 +313,6 @@ _sysfs: Any = i2c
 _routed: dict[_FileKey, KernelBus] = {}
 _kernel_ioctl: Any = None
 _kernel_name = i2c.adapter_name
-
-
-class RoutedFile:
-    """A file at ``path`` whose ``ioctl`` calls go to a simulated bus when smbus2 opens it."""
-
-    def __init__(self, adapter: KernelBus) -> None:
-        global _kernel_ioctl
-        self._fd: int | None = os.memfd_create("sim-i2c")  # without a name, so that a killed program leaves no file
-        self.path = f"/dev/fd/{self._fd}"
-        self._key = _file_key(os.fstat(self._fd))
-        if not _routed:
-            _kernel_ioctl, _seam.ioctl, _sysfs.adapter_name = _seam.ioctl, _routed_ioctl, _routed_name
-        _routed[self._key] = adapter
-
-    def close(self) -> None:
-        """Remove the file; a second call does nothing."""
-        if _routed.pop(self._key, None) and not _routed:
-            _seam.ioctl, _sysfs.adapter_name = _kernel_ioctl, _kernel_name
-        if self._fd is not None:
-            os.close(self._fd)
-            self._fd = None
 
 
 def open_files() -> int:

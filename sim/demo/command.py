@@ -67,10 +67,10 @@ def demo(
     Example: rig demo --change light
     """
     from sim.change import Change
-    from sim.demo.run import run_demo
+    from sim.demo.run import GOOD_SHARE, run_demo
     from sim.faults import Fault
 
-    result = run_demo(
+    totals = run_demo(
         settings,
         objects=objects,
         count=count,
@@ -82,8 +82,9 @@ def demo(
         empty_table=not no_empty_table,
     )
     if settings.json:
-        settings.print_json(result.as_dict())
-    if not result.good:
+        settings.print_json(totals)
+    right, of = totals["found"] + totals["unknown_recognised"], totals["of"] + totals["of_unknown"]
+    if right < GOOD_SHARE * of:
         raise typer.Exit(EXIT_QUALITY)
 
 

@@ -7,7 +7,7 @@ import statistics
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
@@ -77,50 +77,6 @@ GOOD_SHARE = 0.8
 SimObject = Solid | PhotographsOnTable
 
 
-@dataclass(frozen=True, slots=True)
-class DemoResult:
-    """The result of a demo; everything but ``wall_s`` is determined by the seed."""
-
-    enrollments: tuple[Record, ...]
-    trials: tuple[Record, ...]
-    seed: int
-    strategy: str
-    change: Change | None
-    bench_s: float
-    wall_s: float
-    report: Path
-
-    @property
-    def good(self) -> bool:
-        return count_of(Correctness.RIGHT, self.trials) >= GOOD_SHARE * len(self.trials)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the totals and every trial as plain data."""
-        known = [trial for trial in self.trials if trial.truth and trial.truth.name is not None]
-        unknown = [trial for trial in self.trials if trial.truth and trial.truth.name is None]
-        errors = [error for trial in self.trials if (error := trial.pose_error_deg) is not None]
-        answers = [trial.answer for trial in self.trials if trial.answer]
-        return {
-            "seed": self.seed,
-            "strategy": self.strategy,
-            "change": None if self.change is None else asdict(self.change),
-            "enrolled": len(self.enrollments),
-            "views_enrolled": sum(len(record.views) for record in self.enrollments),
-            "found": count_of(Correctness.RIGHT, known),
-            "ambiguous": count_of(Correctness.AMBIGUOUS, known),
-            "of": len(known),
-            "unknown_recognised": count_of(Correctness.RIGHT, unknown),
-            "of_unknown": len(unknown),
-            "mean_views": statistics.fmean(answer.views for answer in answers),
-            "travelled_deg": sum(answer.travelled_deg for answer in answers),
-            "median_pose_error_deg": statistics.median(errors) if errors else None,
-            "bench_seconds": self.bench_s,
-            "wall_seconds": self.wall_s,
-            "report": str(self.report),
-            "trials": [_trial(trial) for trial in self.trials],
-        }
-
-
 def run_demo(
     settings: Settings,
     *,
@@ -132,13 +88,14 @@ def run_demo(
     change: Change | None = None,
     faults: Sequence[Fault] = (),
     empty_table: bool = True,
-) -> DemoResult:
+) -> dict[str, Any]:
     """Enroll a shelf, identify each object and two unknown ones, print the events, and write ``out/report.html``.
 
     Each object is enrolled with ``views`` views, by default ``enroll.views`` if the configuration has it, or `VIEWS`.
     The search uses ``strategy``, by default ``identify.strategy``. With ``objects`` these are photographs. The bench is
     changed (``change``) after the enrollments. Without ``empty_table`` no empty-table image is taken. The ``faults``
-    and those of the configuration are injected meanwhile.
+    and those of the configuration are injected meanwhile. Returns the totals and every trial as plain data; everything
+    but ``wall_seconds`` is determined by the seed.
 
     Raises `UsageError`: there are fewer objects than ``count``, ``out`` is not writable, or photographs cannot show the
     ``change``. `ConfigError`: the options of the simulated bench have mistakes, or there are no photographs.
@@ -159,7 +116,10 @@ def run_demo(
     seed = settings.seed or 0
     world = World(noise=NoiseModel(**options.noise), seed=seed)
     if objects is None:
-        enrolled, unknown = _choose(count)
+        things: Mapping[str, SimObject] = shelf()
+        known = {name: things[name] for name in dict.fromkeys([*ENROLLED, *things]) if name not in UNKNOWN_OBJECTS}
+        enrolled = _first(known, count or len(ENROLLED))
+        unknown = {name: things[name] for name in UNKNOWN_OBJECTS}
         operator = ShelfOperator(world, {**enrolled, **unknown})
     else:
         if change is not None and (change.hard or change.background or change.placement_mm):
@@ -172,7 +132,9 @@ def run_demo(
             validate(PhotographOptions, section, where="the configuration", prefix=f"bench.{NAME}")
         )
         config = photographed.fitted(config)
-        enrolled, unknown = _choose_photographed(photographed.identified, count)
+        known = dict(photographed.identified)
+        enrolled = _first(known, count or min(COUNT_OF_FOLDER, len(known)))
+        unknown = dict(islice(known.items(), len(enrolled), len(enrolled) + len(UNKNOWN_OBJECTS)))
         operator = PhotographOperator(world, photographed)
     heard = None if settings.json else _say_fault
     with (
@@ -203,7 +165,16 @@ def run_demo(
     # Write the report.
     wall_s = seconds_between(wall_ns, system.now_ns())
     report = out / "report.html"
-    result = DemoResult(tuple(enrollments), tuple(trials), seed, searched_by, change, bench_s, wall_s, report)
+    totals = {
+        "seed": seed,
+        "strategy": searched_by,
+        "change": None if change is None else asdict(change),
+        **_totals(enrollments, trials),
+        "bench_seconds": bench_s,
+        "wall_seconds": wall_s,
+        "report": str(report),
+        "trials": [_trial(trial) for trial in trials],
+    }
     meta = Meta(
         conditions={
             "seed": seed,
@@ -217,12 +188,11 @@ def run_demo(
         wall_clock={"took": f"{wall_s:.1f} s"},
         date=begun,
     )
-    totals = result.as_dict()
     summary = f"{_counts(totals)}, on the simulated bench."
-    write_report(result.report, render_report("Demo of the rig", summary, enrollments, trials, meta=meta))
+    write_report(report, render_report("Demo of the rig", summary, enrollments, trials, meta=meta))
     if not settings.json:
-        _print_totals(result)
-    return result
+        _print_totals(totals)
+    return totals
 
 
 def _say_fault(occurrence: Occurrence) -> None:
@@ -230,24 +200,7 @@ def _say_fault(occurrence: Occurrence) -> None:
     print(f"{occurrence.time_ns * 1e-9:8.2f} s  fault {begins}: {occurrence.fault.kind.name}", file=sys.stderr)
 
 
-_Objects = Mapping[str, SimObject]
-
-
-def _choose(count: int | None) -> tuple[_Objects, _Objects]:
-    """Return the built-in objects to enroll and the unknown ones."""
-    known: dict[str, SimObject] = {name: thing for name, thing in shelf().items() if name not in UNKNOWN_OBJECTS}
-    enrolled = _first({name: known[name] for name in dict.fromkeys([*ENROLLED, *known])}, count or len(ENROLLED))
-    return enrolled, {name: shelf()[name] for name in UNKNOWN_OBJECTS}
-
-
-def _choose_photographed(known: _Objects, count: int | None) -> tuple[_Objects, _Objects]:
-    """Return the objects to enroll, and as unknown ones those that follow them, if there are any."""
-    enrolled = _first(known, count or min(COUNT_OF_FOLDER, len(known)))
-    left = list(known)[len(enrolled) :][: len(UNKNOWN_OBJECTS)]
-    return enrolled, {name: known[name] for name in left}
-
-
-def _first(known: _Objects, count: int) -> _Objects:
+def _first(known: dict[str, SimObject], count: int) -> dict[str, SimObject]:
     if count > len(known):
         raise UsageError(
             f"There are {len(known)} objects to enroll, not {count}.", next_step=f"Use --count {len(known)} or less."
@@ -317,6 +270,25 @@ def _identify(
     return record
 
 
+def _totals(enrollments: Sequence[Record], trials: Sequence[Record]) -> dict[str, Any]:
+    known = [trial for trial in trials if trial.truth and trial.truth.name is not None]
+    unknown = [trial for trial in trials if trial.truth and trial.truth.name is None]
+    errors = [error for trial in trials if (error := trial.pose_error_deg) is not None]
+    answers = [trial.answer for trial in trials if trial.answer]
+    return {
+        "enrolled": len(enrollments),
+        "views_enrolled": sum(len(record.views) for record in enrollments),
+        "found": count_of(Correctness.RIGHT, known),
+        "ambiguous": count_of(Correctness.AMBIGUOUS, known),
+        "of": len(known),
+        "unknown_recognised": count_of(Correctness.RIGHT, unknown),
+        "of_unknown": len(unknown),
+        "mean_views": statistics.fmean(answer.views for answer in answers),
+        "travelled_deg": sum(answer.travelled_deg for answer in answers),
+        "median_pose_error_deg": statistics.median(errors) if errors else None,
+    }
+
+
 def _trial(trial: Record) -> dict[str, Any]:
     assert trial.truth is not None
     assert trial.answer is not None
@@ -344,8 +316,7 @@ def _counts(totals: Mapping[str, Any]) -> str:
 _MARKS = {Correctness.RIGHT: "✓", Correctness.AMBIGUOUS: "?", Correctness.WRONG: "✗"}
 
 
-def _print_totals(result: DemoResult) -> None:
-    totals = result.as_dict()
+def _print_totals(totals: Mapping[str, Any]) -> None:
     table = Table("", "on the table", "found as", box=None, pad_edge=False)
     for heading in ("views", "rotation", "pose\nerror", "score", "margin"):
         table.add_column(heading, justify="right")
@@ -369,6 +340,7 @@ def _print_totals(result: DemoResult) -> None:
         f"{totals['enrolled']} objects enrolled with {totals['views_enrolled']} views. "
         f"{totals['mean_views']:.1f} views per search, {totals['travelled_deg']:.0f}° of rotation in all, "
         f"median pose error {'–' if error is None else f'{error:.1f}°'}.\n"
-        f"Simulated time: {duration_words(result.bench_s)}. Run time: {duration_words(result.wall_s)}.\n"
-        f"Report: {result.report}"
+        f"Simulated time: {duration_words(totals['bench_seconds'])}. "
+        f"Run time: {duration_words(totals['wall_seconds'])}.\n"
+        f"Report: {totals['report']}"
     )

@@ -57,8 +57,6 @@ class ServoBus:
         receives instead (other bytes, another time), or None if the frame is lost."""
         self.echo = False
         """Whether the adapter receives its own bytes, like a half-duplex one without a switched receiver."""
-        self.deaf = False
-        """Whether all bytes of the host are lost."""
         self._devices: list[SimServo] = []
         self._deliver: Callable[[SentBytes], None] | None = None
         self._sent_until_ns = 0
@@ -91,8 +89,7 @@ class ServoBus:
             tap(frame)
         if self.echo and self._deliver is not None:
             self._deliver(frame)
-        if not self.deaf:
-            self.clock.call_at(frame.end_ns, lambda: self._receive(frame))
+        self.clock.call_at(frame.end_ns, lambda: self._receive(frame))
 
     def disturb(self, data: bytes, baudrate: int) -> None:
         """Send bytes to the host that no servo has sent."""
@@ -113,7 +110,7 @@ class ServoBus:
         if packet.bus_id == BROADCAST_ID:  # only a ping is answered then
             slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
         frames = [
-            SentBytes(Sender.DEVICE, now_ns + delay_ns + bus_id * slot_ns, baudrate, status_packet(bus_id, status))
+            SentBytes(Sender.DEVICE, now_ns + delay_ns + bus_id * slot_ns, baudrate, status_packet(bus_id, *status))
             for device, bus_id, delay_ns in called
             if (status := device.execute(packet)) is not None
         ]

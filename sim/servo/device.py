@@ -11,7 +11,7 @@ from sim.servo.control_table import InstructionRejected, Memory
 from sim.servo.controller import Controller
 from sim.servo.models import BAUD_RATES, POSITION_MODE, servo_model
 from sim.servo.motor import Motor
-from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, StatusError, StatusPacket, word
+from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, StatusError, word
 from sim.world import World
 
 BOOT_S = 0.2  # silence after power-up or Reboot; the e-manual states no value
@@ -99,8 +99,8 @@ class SimServo:
         """Whether the servo has power and has booted."""
         return self._powered
 
-    def execute(self, packet: InstructionPacket) -> StatusPacket | None:
-        """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
+    def execute(self, packet: InstructionPacket) -> tuple[int, bytes] | None:
+        """Execute ``packet`` if it is for this servo; return error byte and parameters of the answer, if any."""
         mine, everyones = packet.bus_id == self.bus_id, packet.bus_id == BROADCAST_ID
         if not self._powered or not (mine or everyones):
             return None
@@ -131,8 +131,8 @@ class SimServo:
                 raise InstructionRejected(StatusError.INSTRUCTION)
         return b""
 
-    def _status(self, error: StatusError, data: bytes = b"") -> StatusPacket:
-        return StatusPacket(error | (ALERT if self.memory["Hardware Error Status"] else 0), data)
+    def _status(self, error: StatusError, data: bytes = b"") -> tuple[int, bytes]:
+        return error | (ALERT if self.memory["Hardware Error Status"] else 0), data
 
     def _read(self, address: int, size: int) -> bytes:
         if address + size > self.memory.live_start:

@@ -46,14 +46,6 @@ class InstructionPacket:
     intact: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class StatusPacket:
-    """The answer of a device: the error byte and the parameters."""
-
-    error: int
-    data: bytes = b""
-
-
 def _crc_of_byte(byte: int) -> int:
     crc = byte << 8
     for _ in range(8):
@@ -122,8 +114,7 @@ class PacketParser:
         return packets
 
 
-def status_packet(bus_id: int, status: StatusPacket) -> bytes:
-    """Return the status packet, byte-stuffed."""
-    body = bytes((_STATUS, status.error)) + status.data
-    body = body.replace(_HEADER, _STUFFED)
+def status_packet(bus_id: int, error: int, data: bytes = b"") -> bytes:
+    """Return the answer of a device, byte-stuffed: the error byte and the parameters."""
+    body = (bytes((_STATUS, error)) + data).replace(_HEADER, _STUFFED)
     return with_crc(_HEADER + bytes((0, bus_id)) + (len(body) + 2).to_bytes(2, "little") + body)

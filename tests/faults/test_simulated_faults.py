@@ -180,7 +180,7 @@ def _hooks(devices):
         *(len(hooks) for hooks in (devices.servo_bus.filters, devices.servo.distortions, devices.imu.distortions)),
         *(len(hooks) for hooks in (devices.i2c.nack_conditions, devices.camera.filters, devices.camera.grab_failures)),
         len(devices.servo_bus._devices),
-        *(devices.servo_bus.echo, devices.servo_bus.deaf, devices.i2c.stuck, devices.i2c.held, devices.camera.hangs),
+        *(devices.servo_bus.echo, devices.i2c.stuck, devices.i2c.held, devices.camera.hangs),
         *(devices.camera.every, devices.camera.latency_ns, devices.camera.blur_px, devices.world.noise),
         *(
             devices.servo.powered,

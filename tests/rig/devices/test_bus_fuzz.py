@@ -21,7 +21,7 @@ from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
-from sim.servo.protocol2 import StatusPacket, crc16, status_packet
+from sim.servo.protocol2 import crc16, status_packet
 from sim.world import World
 from tests.fuzzing import fuzz_settings
 from tests.rig.devices.scripted_serial import scripted_bus
@@ -58,8 +58,8 @@ def spoiled(draw: st.DrawFn, packet: bytes) -> bytes:
                     + data
                 )
             case 5:
-                other = StatusPacket(draw(st.integers(0, 255)), draw(st.binary(max_size=6)))
-                data = bytearray(status_packet(draw(st.integers(0, 252)), other)) + data
+                other = draw(st.integers(0, 255)), draw(st.binary(max_size=6))
+                data = bytearray(status_packet(draw(st.integers(0, 252)), *other)) + data
             case 6:
                 data += bytes(data)
     return bytes(data)
@@ -91,7 +91,7 @@ def test_read_block_was_sent_by_the_device(data: st.DataObject, value: int) -> N
     block = value.to_bytes(4, "little")
     # The driver asks for one byte more each time an answer is owed, from one address lower.
     sent = [b"\x55" * extra + block for extra in range(3)]
-    answers = [data.draw(spoiled(status_packet(1, StatusPacket(0, parameters)))) for parameters in sent]
+    answers = [data.draw(spoiled(status_packet(1, 0, parameters))) for parameters in sent]
     bus, wire = scripted_bus(*answers, retries=2)
     clock = bus.port.clock
     try:

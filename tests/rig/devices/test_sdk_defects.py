@@ -23,7 +23,7 @@ from rig.devices.dynamixel.packets import WRITE, Packets
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import Register, control_table
 from sim.servo import Sender, SentBytes
-from sim.servo.protocol2 import PacketParser, StatusPacket, status_packet
+from sim.servo.protocol2 import PacketParser, status_packet
 from tests.fuzzing import examples, fuzz_settings
 from tests.rig.bench_parts import open_bus, servo_wires
 from tests.rig.devices.scripted_serial import scripted_bus
@@ -82,21 +82,21 @@ def test_late_reply_answers_no_other_read(late_ms: float, pauses_ms: list[float]
 @pytest.mark.parametrize("size", [0, 1, 3, 25])
 def test_reply_of_another_length_is_ignored(size: int) -> None:
     """The SDK reads the requested number of bytes, and uses the CRC as the value if there are too few."""
-    bus, _ = scripted_bus(status_packet(1, StatusPacket(0, bytes(range(size)))))
+    bus, _ = scripted_bus(status_packet(1, 0, bytes(range(size))))
     with pytest.raises(DeviceSilent):
         bus.read(1, TABLE["Present Input Voltage"])
     assert bus.statistics.late == 1
 
 
 def test_reply_of_another_servo_is_ignored() -> None:
-    bus, _ = scripted_bus(status_packet(2, StatusPacket(0, b"\x78\0")) + status_packet(1, StatusPacket(0, b"\x77\0")))
+    bus, _ = scripted_bus(status_packet(2, 0, b"\x78\0") + status_packet(1, 0, b"\x77\0"))
     assert bus.read(1, TABLE["Present Input Voltage"]) == 0x77
     assert bus.statistics.foreign == 1
 
 
 def test_rejection_without_parameters_raises_no_index_error() -> None:
     """If only an error answers a ping, the SDK reads model and firmware from missing bytes."""
-    bus, _ = scripted_bus(status_packet(1, StatusPacket(0x07)))
+    bus, _ = scripted_bus(status_packet(1, 0x07))
     with pytest.raises(RequestRejected, match="access error"):
         bus.ping(1)
 
@@ -104,18 +104,18 @@ def test_rejection_without_parameters_raises_no_index_error() -> None:
 @fuzz_settings(0.3)
 @given(data=tricky.filter(lambda data: len(data) >= 2))
 def test_unstuffing_keeps_all_bytes(data: bytes) -> None:
-    bus, _ = scripted_bus(status_packet(1, StatusPacket(0, data)))
+    bus, _ = scripted_bus(status_packet(1, 0, data))
     assert bus.read_block(1, 0, len(data)) == data
 
 
 def test_values_are_signed() -> None:
-    bus, _ = scripted_bus(*2 * [status_packet(1, StatusPacket(0, (-5000).to_bytes(4, "little", signed=True)))])
+    bus, _ = scripted_bus(*2 * [status_packet(1, 0, (-5000).to_bytes(4, "little", signed=True))])
     assert Protocol2PacketHandler().read4ByteTxRx(bus.port, 1, 132)[0] == 4294962296
     assert bus.read(1, TABLE["Present Position"]) == -5000
 
 
 def test_alert_bit_does_not_invalidate_data() -> None:
-    bus, _ = scripted_bus(status_packet(1, StatusPacket(0x80, b"\x78\0")))
+    bus, _ = scripted_bus(status_packet(1, 0x80, b"\x78\0"))
     assert bus.read(1, TABLE["Present Input Voltage"]) == 120
     assert bus.alert(1)
 

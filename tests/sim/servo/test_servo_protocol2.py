@@ -10,7 +10,6 @@ from sim.servo.protocol2 import (
     BROADCAST_ID,
     InstructionPacket,
     PacketParser,
-    StatusPacket,
     crc16,
     status_packet,
     with_crc,
@@ -64,22 +63,22 @@ def test_emanual_instruction_packets_are_understood(frame: str, packet: Instruct
 @pytest.mark.parametrize(
     ("bus_id", "status", "frame"),
     [
-        (1, StatusPacket(0, b"\x06\x04\x26"), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
-        (2, StatusPacket(0, b"\x06\x04\x26"), "FF FF FD 00 02 07 00 55 00 06 04 26 6F 6D"),
-        (1, StatusPacket(0, b"\xa6\0\0\0"), "FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0"),
-        (1, StatusPacket(0), "FF FF FD 00 01 04 00 55 00 A1 0C"),
-        (2, StatusPacket(0, b"\x24"), "FF FF FD 00 02 05 00 55 00 24 8B A9"),
+        (1, (0, b"\x06\x04\x26"), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
+        (2, (0, b"\x06\x04\x26"), "FF FF FD 00 02 07 00 55 00 06 04 26 6F 6D"),
+        (1, (0, b"\xa6\0\0\0"), "FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0"),
+        (1, (0,), "FF FF FD 00 01 04 00 55 00 A1 0C"),
+        (2, (0, b"\x24"), "FF FF FD 00 02 05 00 55 00 24 8B A9"),
     ],
 )
-def test_status_packets_equal_the_emanuals(bus_id: int, status: StatusPacket, frame: str) -> None:
-    assert status_packet(bus_id, status) == bytes.fromhex(frame)
+def test_status_packets_equal_the_emanuals(bus_id: int, status: tuple[int, bytes], frame: str) -> None:
+    assert status_packet(bus_id, *status) == bytes.fromhex(frame)
 
 
 @quick
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
 @example(bus_id=1, error=0, data=b"\xff\xff\xfd\xff\xfd\xfd")
 def test_byte_stuffing_removes_headers_and_can_be_undone(bus_id: int, error: int, data: bytes) -> None:
-    frame = status_packet(bus_id, StatusPacket(error, data))
+    frame = status_packet(bus_id, error, data)
     assert b"\xff\xff\xfd\x00" not in frame[4:-2]
     assert SDK.updateCRC(0, frame, len(frame) - 2) == frame[-2] | frame[-1] << 8
     assert bytes(Packets().removeStuffing(list(frame))[7:-2]) == bytes((0x55, error)) + data
