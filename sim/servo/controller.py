@@ -4,16 +4,13 @@ from enum import IntEnum
 from math import cos, radians, sin
 
 from sim.servo.control_table import Memory
-from sim.servo.models import EXTENDED_POSITION_MODE, GAINS, POSITION_MODE, VELOCITY_MODE, ServoModel
+from sim.servo.models import EXTENDED_POSITION_MODE, GAINS, POSITION_MODE, ServoModel
 from sim.servo.motor import Motor
 from sim.world import World
 
 # the e-manual calls these two thresholds of Moving Status predefined and states no values
 IN_POSITION_DEG, FOLLOWING_ERROR_DEG = 0.36, 8.8
-SINGLE_TURN_HOMING_COUNTS = 1024  # a larger Homing Offset is ignored in position mode
 TICK_MODULUS_MS = 32_768
-
-_REVERSE, _TIME_BASED = 0x01, 0x04  # bits of Drive Mode
 
 
 class Profile(IntEnum):
@@ -28,10 +25,10 @@ class Profile(IntEnum):
 class Controller:
     """Converts the goal registers to trajectories of the motor.
 
-    Position registers count the steps of the model's row from the encoder's zero, in the direction of Drive Mode. Whole
-    revolutions are counted until `wrap_position`, as in the e-manual. Gains, PWM and current limits are stored but have
-    no effect. `harmonics_deg` is the encoder's error over a revolution: cosine and sine of the first and the second
-    harmonic.
+    Position registers count the steps of the model's row from the encoder's zero. Whole revolutions are counted until
+    `wrap_position`, as in the e-manual. Gains, PWM and current limits, Drive Mode and Homing Offset are stored but have
+    no effect, and in velocity mode nothing moves: before it moves a servo, the rig has set the last three.
+    `harmonics_deg` is the encoder's error over a revolution: cosine and sine of the first and the second harmonic.
     """
 
     def __init__(self, world: World, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
@@ -88,18 +85,13 @@ class Controller:
 
     def pursue_position(self) -> None:
         """Plan the profile to Goal Position (e-manual, "What is the Profile"); other modes ignore it."""
-        if self._memory["Operating Mode"] == VELOCITY_MODE:
+        if self._memory["Operating Mode"] not in (POSITION_MODE, EXTENDED_POSITION_MODE):
             return
         goal_deg = self._degrees(self._memory["Goal Position"])
         velocity, acceleration = self._memory["Profile Velocity"], self._memory["Profile Acceleration"]
         v_max = min(self._motor.fastest_dps, self._memory["Velocity Limit"] * self._row.dps_per_unit)
         a_max = self._motor.steepest_dps2
-        if velocity and self._time_based:
-            ramp_s = min(acceleration, velocity / 2) * 1e-3
-            distance = abs(goal_deg - self._motor.state().target_deg)
-            v_max = min(v_max, distance / (velocity * 1e-3 - ramp_s))
-            a_max = min(a_max, v_max / ramp_s) if ramp_s else a_max
-        elif velocity:
+        if velocity:
             v_max = min(v_max, velocity * self._row.dps_per_unit)
             a_max = min(a_max, acceleration * self._row.dps2_per_unit) if acceleration else a_max
         self._motor.go_to(goal_deg, max(v_max, _STANDSTILL), max(a_max, _STANDSTILL))
@@ -111,25 +103,11 @@ class Controller:
             peak = float(abs(self._motor.commanded.velocity_dps).max())
             self._profile = Profile.TRAPEZOIDAL if peak >= v_max * (1 - 1e-9) else Profile.TRIANGULAR
 
-    def pursue_velocity(self) -> None:
-        """Ramp to Goal Velocity; other modes ignore it."""
-        if self._memory["Operating Mode"] != VELOCITY_MODE:
-            return
-        fastest = self._motor.fastest_dps
-        goal_dps = min(max(self._sign * self._memory["Goal Velocity"] * self._row.dps_per_unit, -fastest), fastest)
-        acceleration, a_max = self._memory["Profile Acceleration"], self._motor.steepest_dps2
-        if acceleration and self._time_based:
-            a_max = min(a_max, abs(goal_dps - self._motor.state().target_dps) / (acceleration * 1e-3))
-        elif acceleration:
-            a_max = min(a_max, acceleration * self._row.dps2_per_unit)
-        self._motor.rotate_at(goal_dps, max(a_max, _STANDSTILL))
-        self._profile = Profile.TRAPEZOIDAL if acceleration else Profile.STEP
-
     def wrap_position(self) -> None:
         """Reset the count of revolutions: the position continues from within one revolution."""
         self._revolution_counts = 0
         positions = self._memory.one_revolution
-        present = self._present_position() - self._homing - positions.start
+        present = self._present_position() - positions.start
         self._revolution_counts = present - present % len(positions)
         self._memory["Goal Position"] = self._present_position()
 
@@ -145,7 +123,7 @@ class Controller:
         """Update the registers that follow the world."""
         memory, motor, state = self._memory, self._motor, self._motor.state()
         present, target = self._present_position(), self._counts(state.target_deg)
-        velocity = self._sign * round(state.speed_dps / self._row.dps_per_unit)
+        velocity = round(state.speed_dps / self._row.dps_per_unit)
         status = self._moving_status(present, target)
         noise_v = self._world.noise.voltage_noise_v
         voltage = motor.terminal_v(state.load) + (noise_v * self._rng.standard_normal() if noise_v else 0.0)
@@ -153,14 +131,14 @@ class Controller:
         memory["Realtime Tick"] = elapsed_ms % TICK_MODULUS_MS
         memory["Moving"] = int(bool(status & 0x02) or abs(velocity) > memory["Moving Threshold"])
         memory["Moving Status"] = status
-        memory["Present PWM"] = self._sign * round(state.pwm * self._pwm_full)
+        memory["Present PWM"] = round(state.pwm * self._pwm_full)
         if self._model.stall_current is None:
-            memory["Present Load"] = self._sign * round(state.load * 100 / self._row.load_percent_per_unit)
+            memory["Present Load"] = round(state.load * 100 / self._row.load_percent_per_unit)
         else:
-            memory["Present Current"] = self._sign * round(state.load * self._model.stall_current)
+            memory["Present Current"] = round(state.load * self._model.stall_current)
         memory["Present Velocity"] = velocity
         memory["Present Position"] = present
-        memory["Velocity Trajectory"] = self._sign * round(state.target_dps / self._row.dps_per_unit)
+        memory["Velocity Trajectory"] = round(state.target_dps / self._row.dps_per_unit)
         memory["Position Trajectory"] = target
         memory["Present Input Voltage"] = max(round(voltage / self._row.v_per_unit), 0)
         memory["Present Temperature"] = min(max(round(motor.temperature_c(state.load)), 0), 255)
@@ -168,44 +146,21 @@ class Controller:
     def _moving_status(self, present: int, target: int) -> int:
         if not self._memory["Torque Enable"]:
             return 0
-        profile = self._profile << 4
-        if self._memory["Operating Mode"] == VELOCITY_MODE:
-            return profile
         in_position = abs(self._memory["Goal Position"] - present) * self._row.deg_per_count < IN_POSITION_DEG
         ongoing = self._profile != Profile.STEP and self._motor.profile_ongoing
         following_error = abs(target - present) * self._row.deg_per_count > FOLLOWING_ERROR_DEG
-        return profile | following_error << 3 | ongoing << 1 | in_position
+        return self._profile << 4 | following_error << 3 | ongoing << 1 | in_position
 
     # -- scales ---------------------------------------------------------------------------------------------------
-
-    @property
-    def _sign(self) -> int:
-        return -1 if self._memory["Drive Mode"] & _REVERSE else 1
-
-    @property
-    def _time_based(self) -> bool:
-        return bool(self._memory["Drive Mode"] & _TIME_BASED)
-
-    @property
-    def _homing(self) -> int:
-        offset = self._memory["Homing Offset"]
-        ignored = self._memory["Operating Mode"] == POSITION_MODE and abs(offset) > SINGLE_TURN_HOMING_COUNTS
-        return 0 if ignored else offset
 
     def _counts(self, angle_deg: float) -> int:
         """Return the value of a position register at a shaft angle."""
         read_deg = angle_deg + self._encoder_error_deg(angle_deg)
-        return (
-            self._sign * round(read_deg / self._row.deg_per_count + self._center)
-            - self._revolution_counts
-            + self._homing
-        )
+        return round(read_deg / self._row.deg_per_count + self._center) - self._revolution_counts
 
     def _degrees(self, counts: int) -> float:
         """Return the shaft angle at which a position register reads ``counts``."""
-        read_deg = (
-            self._sign * (counts - self._homing + self._revolution_counts) - self._center
-        ) * self._row.deg_per_count
+        read_deg = (counts + self._revolution_counts - self._center) * self._row.deg_per_count
         angle_deg = read_deg
         for _ in range(3):  # the error changes by a hundredth of the angle at most
             angle_deg = read_deg - self._encoder_error_deg(angle_deg)

@@ -23,7 +23,6 @@ WATCHDOG_TRIPPED = 0xFF
 VOLTAGE_ERROR, OVERHEATING_ERROR, ENCODER_ERROR, ELECTRICAL_ERROR, OVERLOAD_ERROR = 0x01, 0x04, 0x08, 0x10, 0x20
 """Bits of Hardware Error Status and Shutdown."""
 
-_TIME_BASED = 0x04  # bit of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 
 
@@ -68,15 +67,13 @@ class SimServo:
         self._controller = Controller(world, self.memory, self.motor, self.model, center)
         self._heard_ns = 0
         self._on_write: dict[str, Callable[[], None]] = {
-            "Drive Mode": self._controller.wrap_position,
             "Operating Mode": self._controller.change_mode,
             "Temperature Limit": self._check_shutdown,
             "Max Voltage Limit": self._check_shutdown,
             "Min Voltage Limit": self._check_shutdown,
             "Torque Enable": self._on_torque_enable,
             "Bus Watchdog": self._arm_watchdog,
-            "Goal Velocity": lambda: self._on_goal(self._controller.pursue_velocity),
-            "Goal Position": lambda: self._on_goal(self._controller.pursue_position),
+            "Goal Position": self._on_goal,
         }
         self._start()
 
@@ -174,9 +171,7 @@ class SimServo:
                 limit = memory[name.removeprefix("Goal ") + " Limit"]
                 return -limit, limit
             # e-manual, P series and MX (2.0): the models with an Acceleration Limit limit their profile
-            case "Profile Velocity" | "Profile Acceleration" if (
-                "Acceleration Limit" in memory and not memory["Drive Mode"] & _TIME_BASED
-            ):
+            case "Profile Velocity" | "Profile Acceleration" if "Acceleration Limit" in memory:
                 return 0, memory[name.removeprefix("Profile ") + " Limit"]
         return value, value
 
@@ -287,9 +282,9 @@ class SimServo:
         self._arm_watchdog()
         self._supervise()
 
-    def _on_goal(self, pursue: Callable[[], None]) -> None:
+    def _on_goal(self) -> None:
         if self.memory["Torque Enable"]:  # in the drive mode "torque on by goal update", too: the rig switches it off
-            pursue()
+            self._controller.pursue_position()
             self._supervise()
 
     def _check_shutdown(self) -> None:
