@@ -18,21 +18,11 @@ EPOCH = datetime(2020, 1, 1, tzinfo=UTC)
 class Timer:
     """A callback that is scheduled for a virtual time; `cancel` removes it."""
 
-    def __init__(self, at_ns: int, callback: Callable[[], None]) -> None:
-        self.at_ns = at_ns
-        self._callback: Callable[[], None] | None = callback
-
-    @property
-    def pending(self) -> bool:
-        return self._callback is not None
+    def __init__(self, callback: Callable[[], None]) -> None:
+        self.callback: Callable[[], None] | None = callback
 
     def cancel(self) -> None:
-        self._callback = None
-
-    def fire(self) -> None:
-        callback, self._callback = self._callback, None
-        if callback is not None:
-            callback()
+        self.callback = None
 
 
 class VirtualClock:
@@ -64,36 +54,32 @@ class VirtualClock:
 
     def call_at(self, at_ns: int, callback: Callable[[], None]) -> Timer:
         """Schedule ``callback`` for ``at_ns``; a time in the past means the next time the clock advances."""
-        timer = Timer(max(at_ns, self._now_ns), callback)
-        heapq.heappush(self._timers, (timer.at_ns, next(self._order), timer))
+        timer = Timer(callback)
+        heapq.heappush(self._timers, (max(at_ns, self._now_ns), next(self._order), timer))
         return timer
 
     def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
         """Call ``action`` every ``seconds`` of virtual time, during sleeps; return the function that stops it."""
-        timer: Timer | None = None
+        timer: Timer
         over = False
 
         def tick() -> None:
+            nonlocal timer
             action()
             if not over:
-                wait()
-
-        def wait() -> None:
-            nonlocal timer
-            timer = self.call_at(self._now_ns + round(seconds * 1e9), tick)
+                timer = self.call_at(self._now_ns + round(seconds * 1e9), tick)
 
         def cancel() -> None:
             nonlocal over
             over = True
-            if timer is not None:
-                timer.cancel()
+            timer.cancel()
 
-        wait()
+        timer = self.call_at(self._now_ns + round(seconds * 1e9), tick)
         return cancel
 
     def next_event_ns(self) -> int | None:
         """Return the time of the next pending callback, or None."""
-        while self._timers and not self._timers[0][2].pending:
+        while self._timers and self._timers[0][2].callback is None:
             heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
@@ -102,7 +88,9 @@ class VirtualClock:
         while (due_ns := self.next_event_ns()) is not None and due_ns <= at_ns:
             timer = heapq.heappop(self._timers)[2]
             self._now_ns = max(self._now_ns, due_ns)
-            timer.fire()
+            callback, timer.callback = timer.callback, None
+            if callback is not None:
+                callback()
         self._now_ns = max(self._now_ns, at_ns)
 
 

@@ -173,31 +173,20 @@ _STEADY_DPS = 0.02
 """Difference of speed at which a shaft counts as following steadily."""
 
 
-class Ripple:
-    """A ripple of the shaft's speed by the share ``share``, which repeats every `_PERIOD_DEG` of the shaft.
+_RIPPLE_DEG = 15.0  # chosen, not measured: 24 waves in each revolution
+_RIPPLE_FADES_DPS = 10.0
 
-    The deviation from the commanded angle is a fixed wave over the shaft's angle. Its amplitude falls to 0 with the
-    speed.
+
+def ripple_deg(share: float, angle_deg: ArrayLike, speed_dps: ArrayLike) -> Floats | np.float64:
+    """Return the deviations of a shaft's angles by the ripple of its speed, ``share`` of the speed.
+
+    It is a fixed wave over the shaft's angle, with a period of `_RIPPLE_DEG`. Its amplitude falls to 0 with the speed.
     """
-
-    _PERIOD_DEG = 15.0  # chosen, not measured: 24 waves in each revolution
-    _FADES_DPS = 10.0
-
-    def __init__(self, share: float) -> None:
-        self._amplitude_deg = share * self._PERIOD_DEG / (2 * np.pi)
-        self._per_deg = 2 * np.pi / self._PERIOD_DEG
-
-    def angle_deg(self, angle_deg: float, speed_dps: float) -> float:
-        """Return the deviation of a shaft's angle by the ripple: like `angles_deg`, for one time."""
-        fade = min(abs(speed_dps) / self._FADES_DPS, 1.0)
-        return self._amplitude_deg * fade * float(np.sin(angle_deg * self._per_deg))
-
-    def angles_deg(self, angle_deg: Floats, speed_dps: Floats) -> Floats | float:
-        """Return the deviations of a shaft's angle by the ripple, at these angles and speeds."""
-        if not self._amplitude_deg:
-            return 0.0
-        fade = np.minimum(np.abs(speed_dps) / self._FADES_DPS, 1.0)
-        return self._amplitude_deg * fade * np.sin(angle_deg * self._per_deg)
+    if not share:
+        return np.float64(0.0)
+    fade = np.minimum(np.abs(speed_dps) / _RIPPLE_FADES_DPS, 1.0)
+    wave = np.sin(np.asarray(angle_deg) * (2 * np.pi / _RIPPLE_DEG))
+    return np.multiply(share * _RIPPLE_DEG / (2 * np.pi) * fade, wave)
 
 
 class Platter:
@@ -207,11 +196,11 @@ class Platter:
     vibration is x'' + 2ζω x' + ω² x = −a(t), solved exactly for each piece of constant shaft acceleration a.
     """
 
-    def __init__(self, play_deg: float, structure_hz: float, damping: float, ripple: Ripple | None = None) -> None:
+    def __init__(self, play_deg: float, structure_hz: float, damping: float, ripple: float = 0.0) -> None:
         self._half_play = play_deg / 2
         self._omega = 2 * np.pi * structure_hz
         self._zeta = damping
-        self._ripple = ripple or Ripple(0.0)
+        self._ripple = ripple
         self.shaft = rest(0.0, 0.0)
         self._platter = np.zeros(1)
         self._shake = np.zeros((1, 2))  # deflection and its rate at each knot
@@ -240,7 +229,7 @@ class Platter:
         piece, since_s = self.shaft.pieces(np.asarray(time_s, dtype=np.float64))
         shaft_deg, speed_dps = self.shaft.within(piece, since_s)
         angle = self._rigid(piece, shaft_deg) + self._vibration(piece, since_s)[0]
-        return angle + self._ripple.angles_deg(shaft_deg, speed_dps)
+        return angle + ripple_deg(self._ripple, shaft_deg, speed_dps)
 
     def _rigid(self, piece: NDArray[np.intp], shaft_deg: Floats) -> Floats:
         """Return the angle of a platter that does not vibrate."""

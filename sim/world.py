@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.clock import VirtualClock
-from sim.motion import Floats, PiecewiseMotion, Platter, Ripple, rest
+from sim.motion import Floats, PiecewiseMotion, Platter, rest, ripple_deg
 from sim.noise import NoiseModel
 
 HISTORY_S = 12.0  # time for which the past is stored: longer than the IMU's FIFO and the camera's buffers
@@ -78,7 +78,6 @@ class World:
         self.seed = seed
         self.listeners: list[Callable[[Activity], None]] = []
         self._scenes: list[tuple[int, Scene]] = [(0, Scene())]
-        self._ripple = Ripple(self.noise.speed_ripple)
         first = self._platter()
         first.follow(rest(0.0, start_deg), None)
         self._motions: list[tuple[int, Platter]] = [(0, first)]
@@ -119,7 +118,7 @@ class World:
     def rippled_deg(self) -> float:
         """Return the angle of the servo's shaft with the ripple of its speed, as the encoder sees it."""
         angle_deg, speed_dps = self.shaft()
-        return angle_deg + self._ripple.angle_deg(angle_deg, speed_dps)
+        return angle_deg + float(ripple_deg(self.noise.speed_ripple, angle_deg, speed_dps))
 
     def table_deg(self, time_ns: int | None = None) -> float:
         """Return the true angle of the platter, now or at a time not longer ago than `HISTORY_S`."""
@@ -173,7 +172,7 @@ class World:
 
     def _platter(self) -> Platter:
         noise = self.noise
-        return Platter(noise.backlash_deg, noise.structure_hz, noise.structure_damping, self._ripple)
+        return Platter(noise.backlash_deg, noise.structure_hz, noise.structure_damping, noise.speed_ripple)
 
     def _index(self, time_ns: int) -> int:
         for i in range(len(self._motions) - 1, 0, -1):

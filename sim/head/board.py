@@ -337,22 +337,24 @@ class SimHead:
 
 def _load(path: Path) -> Any:
     library = ctypes.CDLL(str(path))
-    board = c_void_p
-    library.board_abi.restype = c_uint32
-    library.board_open.argtypes = [_Environment, ctypes.c_char_p, c_uint32, c_uint32]
-    library.board_open.restype = board
-    library.board_run.argtypes = [board, c_uint64]
-    library.board_take.argtypes = [board, ctypes.c_char_p, c_uint32]
-    library.board_take.restype = c_uint32
-    library.board_receive.argtypes = [board, c_uint64, c_uint8]
-    library.board_set_estop.argtypes = [board, c_bool]
-    library.board_set_stuck.argtypes = [board, c_uint8]
-    library.board_reset.argtypes = [board, c_uint8]
-    library.board_hang.argtypes = [board, c_bool]
-    library.board_close.argtypes = [board]
-    for name in ("board_run", "board_receive", "board_set_estop", "board_set_stuck", "board_reset", "board_hang"):
-        getattr(library, name).restype = None
-    library.board_close.restype = None
+    for name, (result, *arguments) in _INTERFACE.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
     if library.board_abi() != ABI:
         raise RuntimeError(f"{path} does not have interface version {ABI}")
     return library
+
+
+_INTERFACE: dict[str, tuple[Any, ...]] = {
+    "board_abi": (c_uint32,),
+    "board_open": (c_void_p, _Environment, ctypes.c_char_p, c_uint32, c_uint32),
+    "board_run": (None, c_void_p, c_uint64),
+    "board_take": (c_uint32, c_void_p, ctypes.c_char_p, c_uint32),
+    "board_receive": (None, c_void_p, c_uint64, c_uint8),
+    "board_set_estop": (None, c_void_p, c_bool),
+    "board_set_stuck": (None, c_void_p, c_uint8),
+    "board_reset": (None, c_void_p, c_uint8),
+    "board_hang": (None, c_void_p, c_bool),
+    "board_close": (None, c_void_p),
+}
+"""Result and arguments of each function of ``board.h``."""

@@ -33,7 +33,6 @@ def test_cancelled_timer_does_not_fire(at: list[int], cancelled: set[int]) -> No
         timers[k].cancel()
     clock.advance_to(1_000)
     assert sorted(fired) == [k for k in range(len(at)) if k not in cancelled]
-    assert not any(timer.pending for timer in timers)
 
 
 def test_timer_can_schedule_timers_for_the_same_sleep() -> None:
