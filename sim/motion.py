@@ -151,7 +151,8 @@ class Response:
                 else:
                     w = self._speed(v, error - sign * self.half_deg, lag_s, h)
                     w = 0.0 if w * sign < 0 and self.half_deg else w
-                close_dps = min(_STEADY_DPS, abs(p_dps) / 10 or _STEADY_DPS)
+                # Below the least of these, rounding keeps a shaft from ever being close enough.
+                close_dps = min(_STEADY_DPS, max(abs(p_dps) / 10, 1e-9)) if p_dps else _STEADY_DPS
                 steady = not p_dps2 and max(abs(w - p_dps), abs(v - p_dps)) < close_dps
                 if steady and (p_dps or abs(error) - self.half_deg < _STEADY_DPS * lag_s + abs(v) * h):
                     h, v, w = end_s - t, p_dps, p_dps

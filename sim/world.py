@@ -3,8 +3,7 @@
 Drivers reach the emulated devices through their buses. Tests set and read this world.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
@@ -159,16 +158,6 @@ class World:
     def put(self, object: SimObject | None, yaw_deg: float = 0.0, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
         """Put ``object`` (or nothing) on the platter, rotated by ``yaw_deg`` against the platter's mark."""
         self.change(object=object, yaw_deg=yaw_deg, offset_mm=offset_mm)
-
-    @contextmanager
-    def changed(self, **values: Any) -> Iterator[None]:
-        """Change fields of the scene during a `with` block."""
-        before = self.scene
-        self.change(**values)
-        try:
-            yield
-        finally:
-            self.change(**{name: getattr(before, name) for name in values})
 
     def _platter(self) -> Platter:
         noise = self.noise

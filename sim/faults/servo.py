@@ -45,15 +45,11 @@ simulated_fault("servo.garbage", "The servo's status registers contain random by
 )
 
 
-@simulated_fault(
+simulated_fault(
     "servo.wrong",
     "The encoder's magnet slips on the shaft, so the servo goes to wrong angles.",
     angle=Parameter(5.0, "slip, °", -90, 90),
-)
-def _wrong(devices: SimDevices, _rng: Rng, angle: float) -> None:
-    devices.servo.slip_encoder(angle)
-
-
+)(lambda devices, _, angle: devices.servo.slip_encoder(angle))
 simulated_fault(
     "servo.slow",
     "Each answer is late but within the timeout, as with a USB latency timer of 16 ms.",
@@ -187,9 +183,9 @@ def _brownout(devices: SimDevices, _rng: Rng, volts: float) -> End:
     return restore
 
 
-@simulated_fault("overload", "The servo shuts down because of an overload, until it is rebooted.")
-def _overload(devices: SimDevices, _rng: Rng) -> None:
-    devices.servo.fail(OVERLOAD_ERROR)
+simulated_fault("overload", "The servo shuts down because of an overload, until it is rebooted.")(
+    lambda devices, _: devices.servo.fail(OVERLOAD_ERROR)
+)
 
 
 @simulated_fault(
@@ -203,9 +199,9 @@ def _overheat(devices: SimDevices, _rng: Rng, celsius: float) -> End:
     return lambda: devices.servo.set_temperature(cool_c)
 
 
-@simulated_fault("watchdog_trip", "The servo's Bus Watchdog stops the table, as after a pause of the computer.")
-def _watchdog_trip(devices: SimDevices, _rng: Rng) -> None:
-    devices.servo.trip_watchdog()
+simulated_fault("watchdog_trip", "The servo's Bus Watchdog stops the table, as after a pause of the computer.")(
+    lambda devices, _: devices.servo.trip_watchdog()
+)
 
 
 # -- its gears and the platter ----------------------------------------------------------------------------------------
@@ -223,14 +219,12 @@ def _backlash(devices: SimDevices, _rng: Rng, degrees: float) -> End:
     return lambda: setattr(world, "noise", noise)
 
 
-@simulated_fault(
+simulated_fault(
     "slip",
     "The platter slips on the shaft.",
     angle=Parameter(-6.0, "slip, °", -360, 360),
     seconds=Parameter(0.1, "duration of the slip, s", 0.001, 10),
-)
-def _slip(devices: SimDevices, _rng: Rng, angle: float, seconds: float) -> None:
-    devices.world.slip(angle, seconds)
+)(lambda devices, _, angle, seconds: devices.world.slip(angle, seconds))
 
 
 @simulated_fault(

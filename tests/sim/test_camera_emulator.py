@@ -72,15 +72,6 @@ def test_exposure_and_light_act_linearly(factor: float) -> None:
     assert frame(camera(world)).mean(axis=(0, 1)) == pytest.approx([80 * factor, 80, 80], abs=0.5)
 
 
-def test_vignetting_darkens_the_corners_by_its_share() -> None:
-    world = World(noise=QUIET.with_values(vignetting=0.3))
-    world.put(grey(200))
-    image = frame(camera(world))
-    assert image[239:241, 319:321] == pytest.approx(200, abs=1)
-    for corner in (image[0, 0], image[0, -1], image[-1, 0], image[-1, -1]):
-        assert corner == pytest.approx(140, abs=1)
-
-
 # -- noise ------------------------------------------------------------------------------------------------------------
 
 

@@ -116,16 +116,6 @@ def test_exposure_begins_before_the_stamp_by_offset_and_jitter() -> None:
     assert offsets == pytest.approx(drawn, abs=1.0)
 
 
-def test_lost_frames_do_not_arrive() -> None:
-    world = World(noise=QUIET.with_values(lost_frames=0.5))
-    capture = camera(world)
-    stamps = []
-    for _ in range(40):
-        assert capture.grab()
-        stamps.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * FPS / 1000))
-    assert 1.5 < (stamps[-1] - stamps[0]) / 39 < 2.6
-
-
 def test_mean_time_of_each_row_is_the_middle_of_its_exposure() -> None:
     for steps in (2, 3, 8):
         times, weights = row_weights(10_000_000, 18_000_000, steps, 480)

@@ -1,7 +1,6 @@
 """The simulated MPU-6050, register by register, through the real smbus2."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +9,10 @@ from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
 from sim.i2c import SimI2cBus
-from sim.imu.inertial import InertialModel
 from sim.imu.mpu6050 import BANDWIDTH_HZ, SimMpu6050
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.world import World
-from tests.allan import allan
 from tests.fuzzing import examples
 
 AT = 0x68
@@ -146,16 +143,6 @@ def test_overflowing_fifo_drops_the_oldest_bytes_and_sets_its_flag(chip: Chip) -
     assert newest.tolist() == [[0, 0, 6550]] * 8
 
 
-def test_old_samples_show_the_rate_of_their_own_time(chip: Chip) -> None:
-    chip.wake(dlpf=1, fifo=0x10)
-    for dps in (0.0, 40.0, -80.0):
-        chip.rotate(dps)
-        chip.wait(0.1)
-    rates = np.frombuffer(chip.drain(), ">i2") / 131
-    for third, dps in zip(np.array_split(rates, 3), (0.0, 40.0, -80.0), strict=True):
-        assert np.median(third) == pytest.approx(dps, abs=0.01)
-
-
 @given(slip_deg=st.floats(-0.8, 0.8), after_ms=st.integers(0, 20), view_first=st.booleans())
 @examples(7)
 def test_short_knock_is_measured(slip_deg: float, after_ms: int, view_first: bool) -> None:
@@ -188,46 +175,6 @@ def test_noise_has_the_density_and_the_bandwidth_of_the_filter(dlpf: int) -> Non
     assert rate.std() == pytest.approx(expected, rel=0.1)
     second = rate[: len(rate) // 500 * 500].reshape(-1, 500, 3).sum(axis=1) / 1000  # half-second integrals
     assert second.std() == pytest.approx(density / np.sqrt(2) * np.sqrt(0.5), rel=0.35)
-
-
-def test_bias_scale_and_tilt_are_drawn_with_the_models_spread() -> None:
-    noise = NoiseModel()
-    parts = [SimMpu6050(World(noise=noise, seed=s)).inertial for s in range(300)]
-    assert np.std([p.gyro_bias_dps for p in parts]) == pytest.approx(noise.gyro_bias_dps, rel=0.1)
-    assert np.std([p.gyro_gain - 1 for p in parts]) == pytest.approx(noise.gyro_scale_error, rel=0.1)
-    assert np.std([p.accel_bias_g for p in parts]) == pytest.approx(noise.accel_bias_g, rel=0.1)
-    ups = np.array([p.up for p in parts])
-    assert np.linalg.norm(ups, axis=1) == pytest.approx(1)
-    assert np.std(np.degrees(np.arcsin(ups[:, :2]))) == pytest.approx(noise.imu_tilt_deg, rel=0.1)
-
-
-@pytest.mark.nightly
-def test_flicker_noise_has_one_allan_deviation_at_all_times_however_it_is_read() -> None:
-    floor = (0.004, 0.0, 0.001)
-    times_ns = np.arange(1, 40_001, dtype=np.int64) * 100_000_000
-
-    def rates(parts: int) -> Any:
-        part = InertialModel(World(noise=NoiseModel.none().with_values(gyro_flicker_dps=floor)), "imu")
-        return np.concatenate([part.sample(some, 10.0, 4.9)[0] for some in np.array_split(times_ns, parts)])
-
-    read = rates(1)
-    assert rates(97) == pytest.approx(read, abs=1e-12)
-    for axis, expected in enumerate(floor):
-        tau_s, deviation, _ = allan(read[:, axis], 0.1)
-        between = (tau_s > 2) & (tau_s < 60)
-        assert deviation[between] == pytest.approx(expected, rel=0.2, abs=1e-12)
-
-
-def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
-    with Chip(NoiseModel.none().with_values(imu_tilt_deg=10.0), seed=5) as chip:
-        chip.wake()
-        chip.rotate(-90.0)
-        chip.wait(0.3)
-        words = np.array(chip.words())
-        up = chip.sensor.inertial.up
-        assert up[2] < 0.999
-        assert words[:3] / 16384 == pytest.approx(up, abs=1e-4)
-        assert words[4:] / 131 == pytest.approx(-90 * up, abs=0.01)
 
 
 @given(views_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))

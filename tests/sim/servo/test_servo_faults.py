@@ -219,16 +219,6 @@ def test_servo_without_power_is_silent_and_has_no_torque(line: Line) -> None:
     assert line.read("Present Position") == round((stopped + 30) / DEG_PER_COUNT + 2048) % 4096
 
 
-def test_short_power_cuts_cause_one_boot(line: Line) -> None:
-    for _ in range(3):
-        line.servos[1].power_cycle()
-        line.sleep(BOOT_S / 2)
-    assert not line.servos[1].powered
-    line.servos[1].power_off()
-    line.sleep(5.0)
-    assert not line.servos[1].powered
-
-
 @pytest.mark.parametrize(
     ("option", "message"),
     [({"bus_id": 253}, "253"), ({"baudrate": 56_000}, "56000"), ({"model": "xl999"}, r"xl999.*xl430_w250")],

@@ -30,17 +30,6 @@ def three(line: Line) -> Line:
 # -- ping, read, write ---------------------------------------------------------------------------------------------
 
 
-def test_bytes_on_the_wire_equal_the_emanuals_and_the_sdks(line: Line) -> None:
-    assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, 0)
-    assert line.sent(Sender.HOST) == [bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))]
-    line.frames.clear()
-    recorded = []
-    write = line.port.writePort
-    line.port.writePort = lambda packet: recorded.append(bytes(packet)) or write(packet)
-    line.write("Goal Position", 512)
-    assert recorded == line.sent(Sender.HOST) == [bytes.fromhex("FFFFFD00010900037400000200 00CA89".replace(" ", ""))]
-
-
 @pytest.mark.parametrize(
     ("model", "number"),
     [("xl430_w250", 1060), ("xm430_w350", 1020), ("xl330_m288", 1200), ("mx_28", 30), ("ph54_200_s500", 2020)],
@@ -62,15 +51,6 @@ def test_broadcast_ping_finds_all_servos_in_order_of_id(three: Line) -> None:
     assert result == COMM_SUCCESS
     assert found == {1: [1060, 46], 4: [1200, 52], 7: [1020, 46]}
     assert [data[4] for data in three.sent(Sender.DEVICE)] == [1, 4, 7]
-
-
-def test_two_servos_with_one_id_collide(line: Line) -> None:
-    line.sdk.ping(line.port, 1)
-    alone = line.sent(Sender.DEVICE)[-1]
-    line.add(1)
-    _, result, _ = line.sdk.ping(line.port, 1)
-    assert result != COMM_SUCCESS
-    assert line.sent(Sender.DEVICE)[-1] != alone
 
 
 @pytest.mark.parametrize(

@@ -117,15 +117,6 @@ def test_current_models_report_current() -> None:
 # -- position: revolutions, direction, offset -----------------------------------------------------------------------
 
 
-def test_extended_position_counts_revolutions_also_with_torque_off(line: Line) -> None:
-    line.put(Operating_Mode=4)
-    seconds = line.servos[1].rotate_by_hand(-800.0)
-    line.sleep(seconds)
-    assert line.read("Present Position") == round(2048 - 800 / DEG_PER_COUNT)
-    line.put(Torque_Enable=1)
-    assert line.read("Goal Position") == line.read("Present Position") == round(2048 - 800 / DEG_PER_COUNT)
-
-
 def test_position_mode_loses_the_revolutions_when_torque_is_switched_on(line: Line) -> None:
     seconds = line.servos[1].rotate_by_hand(720.0 + 90.0)
     line.sleep(seconds)
