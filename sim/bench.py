@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,7 +33,6 @@ from sim.optics import Optics
 from sim.world import SimObject, World
 
 _NO_FILES: Final = Path("/nonexistent")
-_UNPLUGGED_S: Final = 8  # long enough to see what the pages say
 _SHOWN_DEG: Final = 25.0  # most objects show their handle and their picture from there
 
 
@@ -175,9 +173,8 @@ class ShelfOperator:
 class SimShelf:
     """The shelf of a simulated bench: a person at a page puts its objects on the table, and changes the bench."""
 
-    def __init__(self, operator: ShelfOperator, unplug: Callable[[], None]) -> None:
+    def __init__(self, operator: ShelfOperator) -> None:
         self._operator = operator
-        self._unplug = unplug
 
     @property
     def things(self) -> list[str]:
@@ -198,7 +195,7 @@ class SimShelf:
         }
 
     def do(self, words: Sequence[str]) -> None:
-        """Put an object on the table in any orientation, clear the table, set the light, or unplug the camera a while.
+        """Put an object on the table in any orientation, clear the table, or set the light.
 
         Raises `UsageError`, `ObjectNotFound`: there is no such thing to do, or no such object.
         """
@@ -211,10 +208,8 @@ class SimShelf:
                 operator.world.put(None)
             case ["light", ("0.25" | "0.5" | "1" | "1.5") as factor]:
                 operator.world.change(light=(float(factor),) * 3)
-            case ["unplug"]:
-                self._unplug()
             case _:
-                raise UsageError("Hands cannot do that.", next_step="put NAME, clear, light 0.5, or unplug.")
+                raise UsageError("Hands cannot do that.", next_step="put NAME, clear, or light 0.5.")
 
 
 def open_sim_bench(
@@ -249,7 +244,8 @@ def open_sim_bench(
             operator.faults.listeners.append(on_fault)
         if owned:
             wires.callback(operator.faults.clear)
-        devices.open_connections()
+        devices.camera.reopen()  # an earlier bench may have closed it
+        devices.reopen_adapter()
         operator.faults.schedule(*faults)
         # Assemble the bench, with a cable that is not wound up in a new world.
         computer = SimComputer(_NO_FILES, devices, config)  # opening a bench looks for no other devices
@@ -275,8 +271,6 @@ class SimBenchKind(BenchKind):
 
     name = "sim"
     options: type[BaseModel] = SimOptions
-    _camera_back_ns = 0
-    """When the camera is plugged in again, on the computer's clock; a bench that is opened before has none."""
 
     def prepare(self, config: RigConfig, options: Any, world: World) -> tuple[RigConfig, ShelfOperator]:  # noqa: ARG002
         """Return the bench's configuration, and the operator with what is on the bench."""
@@ -296,22 +290,10 @@ class SimBenchKind(BenchKind):
             faults = map(Fault.parse, options.faults)
             bench = open_sim_bench(config, operator, faults=faults, open_now=(), name=self.name)
             bench.findings += operator.findings
-            self._keep_unplugged(operator, options)
             if options.object is None:
-                bench.shelf = SimShelf(operator, partial(self._unplug, operator, options))
+                bench.shelf = SimShelf(operator)
             bench.connections.enter_context(held.pop_all())
         return bench
-
-    def _unplug(self, operator: ShelfOperator, options: SimOptions) -> None:
-        self._camera_back_ns = SystemClock().now_ns() + round(_UNPLUGGED_S * 1e9)
-        self._keep_unplugged(operator, options)
-
-    def _keep_unplugged(self, operator: ShelfOperator, options: SimOptions) -> None:
-        """Unplug the camera of a bench until it is plugged in again."""
-        left_s = (self._camera_back_ns - SystemClock().now_ns()) * 1e-9 * (options.speed or 1.0)
-        if left_s > 0 and operator.faults is not None:
-            now_s = operator.world.clock.now_ns() * 1e-9
-            operator.faults.schedule(Fault.parse(f"camera.off@{now_s:.6f}s+{left_s:.6f}s"))
 
     @contextmanager
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:

@@ -111,14 +111,6 @@ class SimDevices(AbstractContextManager["SimDevices"]):
                 ) from error
         return self.adapter
 
-    def open_connections(self) -> None:
-        """Open the port again that a bench has closed, and the camera's stream if the camera is plugged in.
-
-        Raises `DeviceNotFound` if the adapter is unplugged.
-        """
-        self.camera.reopen()
-        self.reopen_adapter()
-
 
 def _imu(config: RigConfig, world: World) -> SimulatedImu:
     row = imu_kind(config.imu.model)

@@ -32,7 +32,7 @@ Words = Annotated[
         embed=True,
         min_length=1,
         max_length=4,
-        description="`put NAME`, `clear`, `light 0.5`, or `unplug` for the camera, word by word",
+        description="`put NAME`, `clear`, or `light 0.5`, word by word",
     ),
 ]
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {

@@ -75,25 +75,22 @@ class RealTime:
 
         ``inputs`` are further file descriptors, each with a function to call when it is readable.
         """
+        end_ns = None if seconds is None else self.now_ns() + round(seconds * 1e9)
         try:
-            self._run(seconds, inputs)
+            while not self.over and (end_ns is None or self.now_ns() < end_ns):
+                with uninterrupted(), self.present():
+                    wait_s = self._wait_s()
+                    ports = [port.fileno() for port in self._ports if port.fileno() >= 0]
+                try:
+                    readable = select.select([*ports, *inputs], [], [], wait_s)[0]
+                except OSError:  # another thread has unplugged a port meanwhile
+                    continue
+                for descriptor in readable:
+                    if descriptor in inputs:
+                        inputs[descriptor]()
         finally:
             with self._lock:  # other threads do not use the world from now on
                 self.over = True
-
-    def _run(self, seconds: float | None, inputs: Mapping[int, Callable[[], object]]) -> None:
-        end_ns = None if seconds is None else self.now_ns() + round(seconds * 1e9)
-        while not self.over and (end_ns is None or self.now_ns() < end_ns):
-            with uninterrupted(), self.present():
-                wait_s = self._wait_s()
-                ports = [port.fileno() for port in self._ports if port.fileno() >= 0]
-            try:
-                readable = select.select([*ports, *inputs], [], [], wait_s)[0]
-            except OSError:  # another thread has unplugged a port meanwhile
-                continue
-            for descriptor in readable:
-                if descriptor in inputs:
-                    inputs[descriptor]()
 
     def _catch_up(self) -> None:
         now_ns = self.now_ns()

@@ -1,7 +1,6 @@
 """Runs a simulated bench in real time, in a folder with its configuration and the names of its ports."""
 
 import shutil
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from itertools import count
 from pathlib import Path
@@ -16,7 +15,6 @@ from rig.config.wording import blank_file
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, UsageError, os_errors_as
 from rig.core.next_steps import Do
-from rig.devices.dynamixel.port import SerialConnection
 from rig.safety.saved_state import BenchLock, FileStore, holder
 from sim.bench import ShelfOperator, SimOptions, new_world, rest_angle_deg
 from sim.computer import configure_servo, write_files
@@ -56,9 +54,11 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         faults.schedule(*map(Fault.parse, options.faults))
 
         # The interfaces for other programs and for the trainee.
-        ports = [_port(devices.reopen_adapter, folder / SERVO, ends)]
+        ports = [PtyPort(devices.reopen_adapter, folder / SERVO)]
         if devices.head is not None:
-            ports.append(_port(devices.head_port, folder / HEAD, ends))
+            ports.append(PtyPort(devices.head_port, folder / HEAD))
+        for port in ports:
+            ends.callback(port.close)
         time = RealTime(world.clock, ports)
         operator = ShelfOperator(world, shelf())
         commands = Commands(operator, devices, faults)
@@ -73,13 +73,6 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         with suppress(KeyboardInterrupt):  # Ctrl+C is the usual end
             time.run(seconds, {server.fileno(): server.handle_request})
     settings.say("The simulated bench has ended.", {"ended": True})
-
-
-def _port(open_connection: Callable[[], SerialConnection], link: Path | None, ends: ExitStack) -> PtyPort:
-    with os_errors_as(UsageError, f"Cannot create {link}.", next_step="Give a name that is not in use."):
-        port = PtyPort(open_connection, link)
-    ends.callback(port.close)
-    return port
 
 
 def _set_up(devices: SimDevices, config: ServoConfig) -> None:
