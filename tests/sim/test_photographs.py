@@ -161,16 +161,6 @@ def test_empty_table_has_an_image_for_each_angle(rig: Rig) -> None:
     assert "for each object" in done.stderr
 
 
-def test_table_gives_objects_angles_and_the_region(rig: Rig) -> None:
-    save(Path("photographs"))
-    rows = [f"cup,{angle},photographs/obj1__{angle}.png,10 5 80 90" for angle in range(0, 360, 90)]
-    Path("views.csv").write_text("\n".join(["object,azimuth_deg,image,region", *rows]))
-    done = rig("enroll", "cup", "--yes", *put(source="views.csv"))
-    assert done.exit_code == 0, done.output
-    with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
-        assert [view.region for view in catalog.object("cup").complete.views] == [(10, 5, 80, 90)] * 4
-
-
 def test_doctor_finds_no_problem_with_the_camera(rig: Rig) -> None:
     save(Path("photographs"))
     done = rig("doctor", "--json", "--only", "camera")
@@ -220,7 +210,7 @@ def test_bench_without_a_source_names_the_key(rig: Rig) -> None:
     done = rig("status")
     assert done.exit_code == 3
     assert "rig config set bench.photographs.source FOLDER" in done.stderr
-    assert rig("config", "check").exit_code == 0
+    assert rig("config", "show").exit_code == 0
 
 
 def test_grey_photographs_and_unused_files_do_not_disturb(rig: Rig) -> None:
