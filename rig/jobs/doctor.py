@@ -3,7 +3,7 @@
 import json
 import platform
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from importlib.metadata import distributions
@@ -75,10 +75,16 @@ def examine(
     progress
         As for `rig.doctor.examination.run_checks`.
     """
-    findings = []
-    for finding in _findings(opened, known, progress):
-        findings.append(finding)
-        yield finding
+    findings = list(known)
+    yield from known
+    try:
+        with opened as context:
+            for finding in examination.run_checks(context, CHECKS, progress):
+                findings.append(finding)
+                yield finding
+    except RigError as error:  # there is no such bench, or no such part of it
+        findings.append(replace(of_error(error), topic="bench"))
+        yield findings[-1]
     count = Counter(finding.level for finding in findings)
     problems, warnings = count[Severity.BAD], count[Severity.WARNING]
     exit_code = next((finding.exit_code for finding in findings if finding.level is Severity.BAD), 0)
@@ -87,17 +93,6 @@ def examine(
         f"{problems or 'No'} problem{'s' * (problems != 1)}, {warnings or 'no'} warning{'s' * (warnings != 1)}, "
         f"{count[Severity.FINE]} fine.",
     )
-
-
-def _findings(
-    opened: AbstractContextManager[DoctorContext], known: Sequence[Finding], progress: Callable[[str], None]
-) -> Iterator[Finding]:
-    yield from known
-    try:
-        with opened as context:
-            yield from examination.run_checks(context, CHECKS, progress)
-    except RigError as error:  # there is no such bench, or no such part of it
-        yield replace(of_error(error), topic="bench")
 
 
 def support_bundle(

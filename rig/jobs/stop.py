@@ -55,7 +55,11 @@ def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None)
             signalled = who.pid > 0 and _signal(who)
         elif server is not None and answer is not StopAnswer.ENDED:  # a server stays, at rest
             if answer is StopAnswer.NOT_CONFIRMED:
-                raise _not_confirmed()
+                raise DeviceSilent(
+                    "The server has ended its jobs, but the servo does not answer it: whether the torque is off is not "
+                    "known.",
+                    next_step="If the table still moves, switch off the servo's supply. Then check the servo's cable.",
+                )
             return StopReport(who, signalled=False, ended=False, torque_was_on=None)
         if not _wait(clock, END_S, lambda: holder(path) is None and holder(path / SERVER_FOLDER) is None):
             if answer is None or signalled:
@@ -87,13 +91,6 @@ def _wait(clock: Clock, seconds: float, done: Callable[[], bool]) -> bool:
             return False
         clock.sleep(POLL_S)
     return True
-
-
-def _not_confirmed() -> DeviceSilent:
-    return DeviceSilent(
-        "The server has ended its jobs, but the servo does not answer it: whether the torque is off is not known.",
-        next_step="If the table still moves, switch off the servo's supply. Then check the servo's cable.",
-    )
 
 
 def _not_reacting(who: Holder, config: RigConfig) -> BenchBusy:

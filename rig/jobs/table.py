@@ -22,14 +22,8 @@ from rig.views.charuco_board import CharucoBoard, detect_board, mark_angle_deg
 
 DEVICES: Final = ("imu",)
 """The devices that a rotation needs besides the servo."""
-OTHERWISE: Final[dict[Subject, SomeSteps]] = {
-    Subject.LONG_WAY: (),
-    Subject.REVOLUTION: ("Otherwise leave it, and give its revolutions:", Do.SET_REVOLUTIONS(revolutions=0)),
-}
-"""What the operator may do instead of an answer."""
 STEPS_DEG: Final = (0.5, 1.0, 5.0, 15.0, 45.0, 90.0)
 """Steps of jog, from seeing whether the table moves to a quarter of a revolution."""
-LEAVE: Final = {Choice.CONTINUE: "rotate", Choice.STOP: "leave it"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +81,12 @@ def home(desk: Desk, *, revolutions: int | None = None) -> Steps[bool]:
                 position_deg = bench.servo.read_state().position_deg
                 angle_deg = safety.angle_reference.with_revolutions(position_deg, revolutions)
             text = f"The table is then at {angle_words(angle_deg, 0)} and rotates by {signed(-angle_deg, 0)}° to home."
+            otherwise: SomeSteps = ()
             if subject is Subject.REVOLUTION:
+                otherwise = "Otherwise leave it, and give its revolutions:", Do.SET_REVOLUTIONS(revolutions=0)
                 text = f"Look at the cable. Is it wound up by {counted(revolutions, 'revolution')}? {text}"
-            question = Question(subject, text, LEAVE, default=Choice.STOP, steps=OTHERWISE[subject])
+            choices = {Choice.CONTINUE: "rotate", Choice.STOP: "leave it"}
+            question = Question(subject, text, choices, default=Choice.STOP, steps=otherwise)
             asks = subject is Subject.REVOLUTION or abs(angle_deg) > 180.0
             if asks and not safety.beyond_limits(angle_deg) and desk.operator.choose(question) is Choice.STOP:
                 return False

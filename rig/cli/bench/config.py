@@ -14,10 +14,10 @@ from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationSt
 from rig.cli.ui.command import Group
 from rig.cli.ui.settings import Settings
 from rig.config import RigConfig
-from rig.config.values import FILE_NAME, Values, default_path, read_values, search_paths
+from rig.config.values import FILE_NAME, default_path, read_values, search_paths
 from rig.config.wording import KeyInfo, key_info, setting_line
 from rig.core.clock import SystemClock
-from rig.core.errors import ConfigError, UsageError
+from rig.core.errors import ConfigError
 from rig.core.masking import masked
 from rig.core.next_steps import Do
 
@@ -28,8 +28,7 @@ app = Group(__doc__)
 def show(
     settings: Settings,
     wanted: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[KEY]...", help="Keys or sections (default: all)."),
+        list[str] | None, typer.Argument(metavar="[KEY]...", help="Keys or sections (default: all).")
     ] = None,
 ) -> None:
     """Show every key as TOML: its value, where the value comes from, and a description.
@@ -41,7 +40,8 @@ def show(
 
     Example: rig config show servo table.limits_deg
     """
-    values, config, options = _checked(settings)
+    values = read_values(settings.config, settings.overrides)
+    config, options = check_config(values)
     in_force = _calibrations_in_force(settings, config)
     applied, _ = apply_results(config, in_force)
 
@@ -57,17 +57,14 @@ def show(
         (info, masked({info.name: value})[info.name], origin(info)) for info, value in every if is_wanted(info.name)
     ]
     if wanted and not rows:
-        raise _unknown(wanted[0], [info.name for info, _ in every])
+        names = [info.name for info, _ in every]
+        near = get_close_matches(wanted[0], [*names, *{name.rpartition(".")[0] for name in names}], n=1)
+        step = f"Did you mean {near[0]}?" if near else Do.SHOW_CONFIGURATION()
+        raise ConfigError(f"There is no key {wanted[0]!r}.", next_step=step)
     if settings.json:
+        about = ("default", "allowed", "unit", "description")
         keys = {
-            info.name: {
-                "value": value,
-                "origin": source,
-                "default": info.default,
-                "allowed": info.allowed,
-                "unit": info.unit,
-                "description": info.description,
-            }
+            info.name: {"value": value, "origin": source, **{name: getattr(info, name) for name in about}}
             for info, value, source in rows
         }
         settings.print_json({"path": values.path, "keys": keys})
@@ -85,10 +82,7 @@ def show(
 @app.command("set", context_settings={"ignore_unknown_options": True})
 def set_(
     settings: Settings,
-    key: Annotated[
-        str,
-        typer.Argument(metavar="KEY", help="Key with its section, for example servo.port."),
-    ],
+    key: Annotated[str, typer.Argument(metavar="KEY", help="Key with its section, for example servo.port.")],
     value: Annotated[
         str,
         typer.Argument(metavar="VALUE", help="New value as in TOML; quotes are optional. none clears an optional key."),
@@ -99,19 +93,9 @@ def set_(
     Example: rig config set servo.port /dev/ttyUSB1
     """
     target = settings.config or default_path() or Path(FILE_NAME)
-    if "." not in key and key not in {info.name for info in key_info(RigConfig)} - {"bench"}:
-        raise UsageError(
-            f"{key!r} has no section.",
-            next_step=("Write SECTION.KEY. For example,", Do.SET_KEY(key="servo.id", value=2)),
-        )
     changed = set_key(target, key, value, settings.overrides)
     text = "\n".join([f"{target}:", *changed]) if changed else f"{target}: no change, the key has this value already."
     settings.say(text, {"path": target, "key": key, "changed": changed})
-
-
-def _checked(settings: Settings) -> tuple[Values, RigConfig, dict[str, BaseModel]]:
-    values = read_values(settings.config, settings.overrides)
-    return values, *check_config(values)
 
 
 def _calibrations_in_force(settings: Settings, config: RigConfig) -> list[CalibrationResult]:
@@ -130,12 +114,3 @@ def _keys(config: RigConfig, options: Mapping[str, BaseModel]) -> Iterator[tuple
     for name, model in options.items():
         for info in key_info(type(model), ("bench", name)):
             yield info, info.value({"bench": options})
-
-
-def _unknown(wanted: str, names: list[str]) -> ConfigError:
-    names += sorted({name.rpartition(".")[0] for name in names} - {""})
-    near = get_close_matches(wanted, names, n=1)
-    return ConfigError(
-        f"There is no key {wanted!r}.",
-        next_step=f"Did you mean {near[0]}?" if near else Do.SHOW_CONFIGURATION(),
-    )

@@ -39,8 +39,7 @@ def doctor(
     bundle: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.zip",
-            help="Also write a support bundle: findings, log, configuration and versions.",
+            metavar="FILE.zip", help="Also write a support bundle: findings, log, configuration and versions."
         ),
     ] = None,
     trace: Annotated[

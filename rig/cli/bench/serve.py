@@ -3,7 +3,7 @@
 import ipaddress
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -38,7 +38,7 @@ def serve(
     new_token: Annotated[
         str | None, typer.Option("--new-token", metavar="NAME", help="Make a token, print it once, and stop.")
     ] = None,
-    role: Annotated[str, typer.Option(metavar="watch|propose|operate", help="What the new token allows.")] = "watch",
+    role: Annotated[Literal["watch", "propose", "operate"], typer.Option(help="What the new token allows.")] = "watch",
     days: Annotated[
         float | None, typer.Option(min=0.01, max=3650, help="How many days the new token is valid (default: always).")
     ] = None,
@@ -58,10 +58,7 @@ def serve(
         import fastapi  # noqa: F401
         import uvicorn  # noqa: F401
     except ImportError as error:
-        raise UsageError(
-            f"rig serve needs packages that are not installed ({error.name}).",
-            next_step=Do.INSTALL_EXTRA(extra="web"),
-        ) from error
+        raise ExtraMissing.of("web", "Servers", error) from error
     from rig.config.values import FILE_NAME, default_path
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
@@ -72,8 +69,6 @@ def serve(
     folder = settings.load().state_path(settings.bench_name) / SERVER_FOLDER
     tokens = Tokens(folder, SystemClock())
     if new_token is not None:
-        if role not in list(Role):
-            raise UsageError(f"{role!r} is not a role.", next_step="Use --role watch, propose or operate.")
         token = tokens.new(new_token, Role(role), days)
         settings.say(token, {"name": new_token, "role": role, "token": token})
         print("This is the only time that the token is shown. Keep it secret.", file=sys.stderr)
@@ -89,8 +84,7 @@ def serve(
     needs_login = login or not is_loopback(host)
     if needs_login and not tokens.stored():
         raise UsageError(
-            f"Everybody at {host} needs a token, and there is none.",
-            next_step=Do.NEW_TOKEN(role="operate"),
+            f"Everybody at {host} needs a token, and there is none.", next_step=Do.NEW_TOKEN(role="operate")
         )
     name = settings.bench_name
     if name in ("sim", "photographs") and "speed" not in settings.load().bench.get(name, {}):

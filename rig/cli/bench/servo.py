@@ -115,8 +115,7 @@ def record(
 
 @app.command("replay")
 def replay_(
-    settings: Settings,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Trace from rig servo record.")],
+    settings: Settings, file: Annotated[Path, typer.Argument(metavar="FILE", help="Trace from rig servo record.")]
 ) -> None:
     """Compare a trace with the drivers and with the simulated devices. Exit code 6 if something differs.
 

@@ -23,8 +23,7 @@ def snapshot(
     refocus: Annotated[
         bool,
         typer.Option(
-            "--refocus",
-            help="Let the autofocus find a new position, and store it. Use it after you moved the camera.",
+            "--refocus", help="Let the autofocus find a new position, and store it. Use it after you moved the camera."
         ),
     ] = False,
 ) -> None:

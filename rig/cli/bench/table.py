@@ -116,10 +116,7 @@ _KEYS: Final = {
 
 
 @command
-def jog(
-    settings: Settings,
-    step: Annotated[float, typer.Option(metavar="DEGREES", help="First step.")] = 5.0,
-) -> None:
+def jog(settings: Settings, step: Annotated[float, typer.Option(metavar="DEGREES", help="First step.")] = 5.0) -> None:
     """Rotate the table with the arrow keys: right is counter-clockwise, left is clockwise.
 
     Up and down change the step. h rotates to home. q ends. Ctrl+C stops a rotation at once. Keys that you press during

@@ -33,13 +33,7 @@ SHOWN: Final = 20
 """Number of rejected files and of objects that are listed. With --json all of them are."""
 
 
-_FORMAT_OF: Final = {
-    "": "folder",
-    ".zip": "bundle",
-    ".csv": "csv",
-    ".json": "json",
-    ".parquet": "parquet",
-}
+_FORMAT_OF: Final = {"": "folder", ".zip": "bundle", ".csv": "csv", ".json": "json", ".parquet": "parquet"}
 """The format that the suffix of a target names."""
 
 
@@ -165,8 +159,7 @@ def export(
     settings: Settings,
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="File or folder to write. It must not exist.")],
     names: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all)."),
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all).")
     ] = None,
     format_: Annotated[
         Literal["bundle", "folder", "csv", "json", "parquet", "coco", "yolo", "colmap", "nerfstudio"] | None,

@@ -52,8 +52,7 @@ def enroll(
         ),
     ] = None,
     fly: Annotated[
-        bool,
-        typer.Option("--fly", help="Take the views in one revolution without a stop (default: enroll.mode)."),
+        bool, typer.Option("--fly", help="Take the views in one revolution without a stop (default: enroll.mode).")
     ] = False,
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Do not ask for an empty-table image. Use the old one, or none.")

@@ -33,8 +33,7 @@ def evaluate(
         ),
     ] = "paper",
     data: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Images obj{N}__{angle}.png or .jpg; the catalog by default."),
+        Path | None, typer.Option(metavar="FOLDER", help="Images obj{N}__{angle}.png or .jpg; the catalog by default.")
     ] = None,
     noise: Annotated[
         str | None, typer.Option(help="Noise of the queries: none, gn, gn:VARIANCE, mb, mb:PIXELS:DEGREES, gn+mb.")

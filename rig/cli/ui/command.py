@@ -6,11 +6,10 @@ This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must 
 import errno
 import functools
 import inspect
-import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import typer
@@ -42,8 +41,12 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         try:
             with guarded_output():
                 try:
-                    with _long_names_are_usage_errors():
+                    try:
                         function(settings, **values)
+                    except OSError as error:  # every question about such a file raises it
+                        if error.errno != errno.ENAMETOOLONG:
+                            raise
+                        raise UsageError("The name of a file is too long.", next_step="Give a shorter path.") from error
                     sys.stdout.flush()
                 except RigError as error:
                     show_error(error, settings)
@@ -69,21 +72,6 @@ class Group(typer.Typer):
     def command(self, name: str | None = None, **extra: Any) -> Callable[[Any], Any]:
         register = super().command(name, **extra)
         return lambda function: register(command(function))
-
-
-@contextmanager
-def _long_names_are_usage_errors() -> Iterator[None]:
-    """Raise `UsageError` for a path that the system does not take. Every question about such a file raises an error."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
-            raise
-        raise UsageError(
-            "The name of a file or of a folder is too long for this computer.",
-            next_step="Give a shorter path.",
-            evidence={"bytes": len(os.fsencode(error.filename or "")), "name": f"{str(error.filename)[:60]}…"},
-        ) from error
 
 
 def show_error(error: RigError, settings: Settings) -> None:

@@ -21,10 +21,7 @@ class CommonOptions(TypedDict):
             help="Bench to use: hardware, sim, sim-bench or the bench of a plug-in (default: default_bench).",
         ),
     ]
-    config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Configuration file (default: rig.toml)."),
-    ]
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Configuration file (default: rig.toml).")]
     overrides: Annotated[
         list[str] | None,
         typer.Option(

@@ -14,13 +14,7 @@ from rig.core.next_steps import in_words
 from rig.plans.operator import Choice, Question
 
 BELL: Final = "\a"
-_KEYS: Final = {
-    Choice.CONTINUE: "y",
-    Choice.RESTART: "n",
-    Choice.KEEP: "k",
-    Choice.SKIP: "s",
-    Choice.STOP: "q",
-}
+_KEYS: Final = {Choice.CONTINUE: "y", Choice.RESTART: "n", Choice.KEEP: "k", Choice.SKIP: "s", Choice.STOP: "q"}
 
 
 class TerminalOperator:
@@ -73,8 +67,7 @@ def read_answer(question: str) -> str | None:
         answer = sys.stdin.readline()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(
-            "The program cannot ask: standard input is not readable.",
-            next_step="Run the command in a terminal.",
+            "The program cannot ask: standard input is not readable.", next_step="Run the command in a terminal."
         ) from error
     if not sys.stdin.isatty():
         print(answer.strip(), file=sys.stderr)  # a log then shows the answers, too
