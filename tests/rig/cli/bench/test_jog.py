@@ -80,10 +80,10 @@ def test_torque_is_off_after_the_end_key_a_fault_and_a_stop(jog, simulated):
         list(jog(s.bench, [FORWARD]))
 
 
-@pytest.mark.parametrize("step_deg", [0.0, -1.0, 361.0, float("nan")])
-def test_impossible_step_is_rejected(jog, simulated, step_deg):
-    with pytest.raises(UsageError):
-        next(jog(simulated().bench, [FORWARD], step_deg=step_deg))
+def test_impossible_step_is_rejected(jog):
+    for step_deg in (0.0, -1.0, 361.0, float("nan")):
+        with pytest.raises(UsageError):
+            next(jog(None, [FORWARD], step_deg=step_deg))
 
 
 class Terminal:

@@ -125,11 +125,21 @@ def test_doctor_uses_the_defaults_if_the_configuration_is_broken(home):
     assert "XL430-W250" in done.stdout
 
 
-def test_find_prints_valid_settings(parts, home):
-    done = rig("find")
-    assert done.exit_code == 0
-    (home / "rig.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
-    config = load_config(home / "rig.toml")
+@pytest.fixture
+def found(home):
+    """Return a function that runs `rig find`, and reads the settings that it prints."""
+
+    def run(*options: str) -> RigConfig:
+        done = rig("find", *options)
+        assert done.exit_code == 0
+        (home / "found.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
+        return load_config(home / "found.toml")
+
+    return run
+
+
+def test_find_prints_valid_settings(parts, found):
+    config = found()
     assert (config.servo.baud, config.servo.id, config.imu.address) == (57_600, 1, 0x68)
     reported = json.loads(rig("find", "--json").stdout)
     assert reported["settings"]["camera.source"] == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
@@ -137,12 +147,8 @@ def test_find_prints_valid_settings(parts, home):
     assert all(line.startswith(("#", "ACTION", "SUBSYSTEM")) for line in udev.splitlines())
 
 
-def test_find_detects_a_rig_head(home):
-    done = rig("find", "--bench", "sim", "--set", "imu.connection=head")
-    assert done.exit_code == 0
-    assert "a rig head" in done.stdout
-    (home / "rig.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
-    config = load_config(home / "rig.toml")
+def test_find_detects_a_rig_head(found):
+    config = found("--bench", "sim", "--set", "imu.connection=head")
     assert config.imu.connection == "head"
     assert config.head.port.endswith("SIM00002-if00-port0")
 
