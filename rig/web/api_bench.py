@@ -26,15 +26,7 @@ from rig.web.server import API, COOKIE, Manager, OperatorPerson, Page, Proposer,
 
 Force = Annotated[bool, Body(embed=True, description="take it over from another operator, who is warned")]
 IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
-Words = Annotated[
-    list[Annotated[str, Field(max_length=100)]],
-    Body(
-        embed=True,
-        min_length=1,
-        max_length=4,
-        description="`put NAME`, `clear`, or `light 0.5`, word by word",
-    ),
-]
+Words = Annotated[list[Annotated[str, Field(max_length=100)]], Body(embed=True, min_length=1, max_length=4)]
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
     201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
 }
@@ -410,7 +402,10 @@ def add_shelf(routes: Routes, server: Server) -> None:
 
     @routes.operate.post("/shelf", tags=["bench"], response_model=ShelfState)
     def use_shelf(words: Words) -> Any:
-        """Do something by hand at a simulated bench; the event `shelf` says what was done."""
+        """Do something by hand at a simulated bench; the event `shelf` says what was done.
+
+        The words are `put NAME`, `clear`, or `light 0.5`.
+        """
         return server.bench.call("by_hand", words=words)
 
     @routes.watch.get("/shelf/{name}", tags=["bench"], response_class=Jpeg)

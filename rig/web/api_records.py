@@ -113,10 +113,7 @@ class Settings(BaseModel):
     file: str | None
 
 
-NewValue = Annotated[
-    bool | int | float | str | list[float] | None,
-    Body(embed=True, description="null clears a key that can be without a value"),
-]
+NewValue = Annotated[bool | int | float | str | list[float] | None, Body(embed=True)]
 
 
 def add_records(routes: Routes, server: Server) -> None:
@@ -186,7 +183,7 @@ def add_records(routes: Routes, server: Server) -> None:
 
     @routes.operate.put("/settings/{key}", tags=["bench"])
     def change_setting(key: Annotated[str, Field(max_length=60)], value: NewValue) -> list[str]:
-        """Write a key into the configuration file; it is in force when the server starts again.
+        """Write a key into the configuration file; it is in force when the server starts again. Null clears a key.
 
         The answer has the lines of the file that were changed: removed ones with `-`, added ones with `+`.
         """
@@ -203,20 +200,15 @@ def add_records(routes: Routes, server: Server) -> None:
 
 
 def _calibration_row(one: CalibrationResult) -> CalibrationRow:
-    same = CalibrationRow.model_fields.keys() - {"rejections", "quantities"}
-    quantities = {
-        key: Quantity(
-            value=found.value,
-            unit=found.unit,
-            uncertainty=found.uncertainty,
-            text=str(found),
-            expanded=found.expanded,
-            budget=list(found.budget),
-        )
-        for key, found in one.estimates.items()
-    }
-    rejections = [str(reason) for reason in one.rejections]
-    return CalibrationRow(**{name: getattr(one, name) for name in same}, rejections=rejections, quantities=quantities)
+    estimates = one.estimates.items()
+    quantities = {key: Quantity(text=str(found), **_same(Quantity, found)) for key, found in estimates}
+    worded = {"rejections": [str(reason) for reason in one.rejections], "quantities": quantities}
+    return CalibrationRow(**_same(CalibrationRow, one) | worded)
+
+
+def _same(model: type[BaseModel], source: object) -> dict[str, Any]:
+    """Return the fields of a model that have the same name in the source."""
+    return {name: getattr(source, name) for name in model.model_fields if hasattr(source, name)}
 
 
 def _is_for_pages(key: str) -> bool:
