@@ -151,6 +151,7 @@ class Tokens:
 
     def _read(self) -> None:
         """Read the file if it has changed."""
+        # A command in a terminal replaces the file while the server runs, so each request looks at its state.
         try:
             status = self._file.stat()
             signature = (status.st_ino, status.st_mtime_ns, status.st_size)
@@ -160,7 +161,7 @@ class Tokens:
         except FileNotFoundError:
             self._known, self._read_at, self._damage = [], None, None
         except (OSError, ValidationError) as error:
-            self._read_at = None
+            self._read_at = None  # it is read again at the next request: it may have been repaired
             self._damage = ConfigError(
                 f"The tokens in {self._file} cannot be read.",
                 next_step=("Delete the file.", Do.NEW_TOKEN()),
@@ -204,6 +205,7 @@ class Sessions:
 
         Raises `LoginRequired`: the token is unknown or has expired. `ConfigError`: the file of the tokens is damaged.
         """
+        # The comparison takes the same time for each wrong token, so that none can be guessed part by part.
         if hmac.compare_digest(token.encode(errors="replace"), self.local_token.encode()):
             return StoredToken(name=LOCAL, role=Role.WATCH, sha256=_hash(token), created_utc=self.clock.utc())
         stored = self.tokens.valid(_hash(token))
@@ -252,6 +254,7 @@ class Lease:
 
         Raises `LeaseHeld`: another operator has it.
         """
+        # A page renews the lease every 15 s; all pages hear of a change of the holder only.
         with self._lock:
             before, renewed = self.holder, self.is_held_by(person)
             if before is not None and not renewed and not force:

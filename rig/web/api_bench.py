@@ -156,7 +156,7 @@ def add_access(routes: Routes, server: Server) -> None:
         _require_login(person, name)
         if not tokens.remove(name):
             raise JobNotFound("There is no token with that name.", next_step="Choose one of GET /api/v1/tokens.")
-        server.hub.wake()
+        server.hub.wake()  # its streams look at once whether they may continue
         holder = server.lease.holder
         if holder is not None and holder.name == name:
             server.lease.release(holder)
@@ -257,10 +257,12 @@ def add_bench(routes: Routes, server: Server) -> None:
             await socket.close(1008)
             return
         await socket.accept()
+        # Two directions at the same time: STOP must not wait for events that a slow network takes long to carry.
         sending = asyncio.ensure_future(_send_events(server, socket))
         try:
             while not sending.done():
                 received = await socket.receive_json()
+                # The page sends a number with its STOP, and knows by it to which press the answer belongs.
                 if isinstance(received, dict) and "stop" in received and server.still_allowed(socket):
                     done = await server.stop()
                     await socket.send_json({"kind": "stopped", "data": {**done, "stop": received["stop"]}})
@@ -296,6 +298,7 @@ async def _send_events(server: Server, socket: WebSocket) -> None:
     async with aclosing(server.hub.messages(last, lambda: server.still_allowed(socket))) as messages:
         async for message in messages:
             if message is not None:
+                # The data are JSON text already, the same for all listeners: they are not made again for each.
                 head = json.dumps({"kind": message.kind, "id": server.hub.id_of(message)})
                 await socket.send_text(f'{head[:-1]}, "data": {message.data}}}')
     await socket.close(1008)
@@ -379,6 +382,7 @@ def add_jobs(routes: Routes, server: Server) -> None:
         """Return the events of a recent job so far, and the id after which a stream continues."""
         server.bench.call("job", job_id=job_id)
         events, last = server.hub.of_job(job_id)
+        # The events are JSON text already; a job of 720 views has some thousands of them.
         content = f'{{"items": [{", ".join(events)}], "last": "{last}"}}'
         return Response(content, media_type="application/json", headers={"Cache-Control": "no-store"})
 

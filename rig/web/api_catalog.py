@@ -178,7 +178,7 @@ def sent_image(
 def _result(catalog: Catalog, result_id: int) -> Result:
     try:
         return find_result(catalog, result_id)
-    except CatalogDamaged:
+    except CatalogDamaged:  # not the fault of the request
         raise
     except CatalogError as error:
         raise JobNotFound(error.what, next_step=error.steps) from error
@@ -338,6 +338,7 @@ def add_bundles(routes: Routes, server: Server) -> None:
             with server.catalog.open_to_change(person) as catalog, read_bundle(path, catalog.clock) as source:
                 return finished(transfer(source, catalog, conflict=on_conflict, descriptors=DESCRIPTORS, jobs=1))
 
+        # The whole file first: an upload that breaks off has changed nothing.
         with TemporaryDirectory(prefix="rig-import-") as folder:
             path = Path(folder) / "upload.rigcat.zip"
             with path.open("wb") as file:
@@ -357,6 +358,7 @@ def add_bundles(routes: Routes, server: Server) -> None:
             with server.catalog.open_to_read() as catalog:
                 write_bundle(path, CatalogSource(catalog, name or ()))
 
+        # The folder must stay until the last byte is sent, so no `with` block can remove it.
         try:
             await long_work(write)
         except BaseException:

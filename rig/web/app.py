@@ -55,6 +55,7 @@ def create_app(server: Server) -> FastAPI:
         add_records,
     ):
         add(routes, server)
+    # One router for each right, so that no route can forget to ask for it.
     for router in vars(routes).values():
         app.include_router(router, prefix=API, responses=_ERRORS)
     others = server.setup.config.serve

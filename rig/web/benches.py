@@ -108,6 +108,7 @@ class OtherBenches:
             if answer is None or (answer.done() and now_s - asked_s > FRESH_S):
                 self._asked[name] = now_s, self._threads.submit(_ask, name, place)
         answers = {name: self._asked[name][1] for name in places}
+        # A bench that is late is asked no second time: its answer counts when the page asks again.
         if answers:
             await asyncio.wait([asyncio.wrap_future(one) for one in answers.values()], timeout=ANSWER_S)
         return [

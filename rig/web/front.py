@@ -89,7 +89,7 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
 
     def ended() -> None:
         web.should_exit = True
-        server.hub.close()
+        server.hub.close()  # uvicorn waits for open streams, and these never end by themselves
         threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
 
     server = Server(setup, SystemClock(), socket.socket(fileno=link_descriptor), ended)

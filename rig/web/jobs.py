@@ -94,6 +94,7 @@ class JobQueue:
                         evidence={"job": earlier.id},
                     )
                 return earlier.model_copy()
+            # What waits is stored at each change, so its size is limited as well as its number.
             waiting = self._waiting(JobState.QUEUED, JobState.PROPOSED)
             size = len(request.model_dump_json()) + sum(len(self._texts[job.id]) for job in waiting)
             if len(waiting) >= MAX_QUEUED or size > MAX_QUEUED_BYTES:
@@ -236,7 +237,7 @@ class JobQueue:
         """End a job; an unfinished one gets the request that continues it."""
         with self._lock:
             job.error = None if error is None else error.problem
-            if state is not JobState.DONE:
+            if state is not JobState.DONE:  # also a cancelled one: who pressed STOP continues later
                 self._offer_to_continue(job, error)
             self._end(state, job)
 
@@ -268,6 +269,7 @@ class JobQueue:
     def _offer_to_continue(self, job: Job, error: RigError | None = None) -> None:
         """Set the request that continues the work of a job that ended early, with this error."""
         request = job.request
+        # A rotation, a check or a calibration leaves nothing to continue: a person asks for it again.
         if isinstance(request, EnrollRequest):
             actions = [step.action for step in (error.steps if error else ()) if isinstance(step, NextStep)]
             started = job.views > 0 or request.resume or Do.CONTINUE_ENROLLMENT in actions
@@ -335,4 +337,5 @@ class JobQueue:
             return
         self._jobs = {job.id: job for job in jobs}
         self._texts = {job.id: job.model_dump_json() for job in jobs}
+        # A program that ended in the middle of a job wrote no end of it.
         self._interrupt(*(job for job in jobs if not job.state.ended))

@@ -65,6 +65,7 @@ class Link:
 
         Raises `BenchBusy`: there is no answer in time.
         """
+        # The thread that reads sets the future; calls of several threads wait for their answers at the same time.
         number, future = next(self._numbers), Future[Any]()
         self._waiting[number] = future
         try:

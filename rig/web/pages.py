@@ -83,6 +83,7 @@ def pages(bench: str, *, with_others: bool) -> APIRouter:
     shared = {"bench": bench, "actions": page_actions(), "dial": Markup(dial())}
     router = APIRouter(include_in_schema=False)
 
+    # A page is the same for all people: what they see and may do comes from the API, which knows their token.
     def page(name: str, title: str, current: str) -> None:
         template = templates.get_template(f"{name or 'bench'}.html.j2")
 

@@ -28,6 +28,7 @@ class LivePicture:
         """Number of the newest frame, from 1; 0 if there is none."""
         return 0 if self._frame is None else self._frame[0]
 
+    # The image becomes a JPEG only when a viewer asks: encoding each frame would take the control loop's time.
     def show(self, image_bgr: NDArray[np.uint8]) -> None:
         """Replace the picture, from the bench's thread; the array must not be changed afterwards."""
         self._frame = (self.number + 1, image_bgr, self._clock.now_ns())

@@ -120,6 +120,7 @@ class WebProcess:
         self._starts.append(self._clock.now_ns())
         self._alive_ns = self._clock.now_ns()
         self._ended.clear()
+        # The set-up goes through a pipe, because everybody can read the arguments of a process, and it has passwords.
         ours, theirs = socket.socketpair()
         with theirs:
             descriptors = (theirs.fileno(), self._connection.fileno())

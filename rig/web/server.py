@@ -157,6 +157,7 @@ class Server:
         if scheme.lower() == "bearer":
             stored = self.sessions.verify(token.strip())
             return Person(stored.name, stored.role, client)
+        # A login that has ended is no error where no login is needed: a browser keeps the cookie of another start.
         if cookie := request.cookies.get(COOKIE):
             found = self.sessions.find(cookie)
             if found is not None:
@@ -258,6 +259,7 @@ class PageOfList:
 
     def of(self, rows: Sequence[Row], key: Callable[[Row], str]) -> Response:
         """Return the page with an ETag, and a link to the next one; ``key`` returns the name of an entry."""
+        # The name of an entry stays right when others are added above it; a number would not.
         start = 0
         if self.after is not None:
             places = [number for number, row in enumerate(rows) if key(row) == self.after]
