@@ -1,5 +1,5 @@
-import { $, API, act, at, counted, duration, followJob, get, h, isEnded, nextSteps, on, showJob, start, submit, table, update, valuesOf } from "./rig.js";
-import { comparisons } from "./pictures.js";
+import { $, act, at, counted, duration, followJob, get, h, headline, isEnded, nextSteps, on, showJob, start, submit, table, update, valuesOf } from "./rig.js";
+import { comparisons, thumbs } from "./pictures.js";
 import "./shelf.js";
 
 // -- one object: a name that is known already is a choice ------------------------------------------------------------------
@@ -103,12 +103,6 @@ let name = "";
 let similar = null;
 let rejected = 0;
 
-function say(words, kind, ...detail) {
-  if ($("said").textContent !== words) $("said").textContent = words;
-  $("said").className = `answer ${kind}`;
-  $("said-detail").replaceChildren(...detail.filter(Boolean));
-}
-
 function take(event) {
   switch (event.event) {
     case "started": [views, similar, rejected, name] = [[], null, 0, event.name || name]; break;
@@ -116,7 +110,7 @@ function take(event) {
       states[event.name] = event.reason ? "skipped" : "now";
       break;
     case "accepted":
-      views.push({ number: event.picture, words: `${event.azimuth_deg.toFixed(0)}°` });
+      views.push(event);
       break;
     case "rejected": rejected += 1; break;
     case "similar_objects": similar = event; break;
@@ -127,7 +121,7 @@ function take(event) {
 
 /** Show the pictures so far; those that are there already stay. */
 function showViews() {
-  update($("thumbs"), ...views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), view.words)));
+  update($("thumbs"), ...thumbs(job, views));
   $("views-section").hidden = !views.length;
   $("views-title").textContent = `${counted(views.length, "view")}${rejected ? `, ${rejected} taken again` : ""}`;
 }
@@ -161,11 +155,11 @@ followJob(["enroll", "tray"], {
     $("forms").hidden = busy;
     showJob($("job"), job, false);
     const left = job.progress?.seconds_left;
-    if (job.question) say(name || "A tray", "calm");
-    else if (job.state === "queued") say("Waiting for the bench …", "calm");
-    else if (busy) say(name || "Preparing …", "calm", `${job.state === "paused" ? "Paused. " : "Keep your hands off the table. "}${left ? `About ${duration(left)} left.` : ""}`);
-    else if (job.state === "done") say(job.request.kind === "tray" ? "The tray is enrolled" : `${job.request.name} is enrolled`, "found", h("p", {}, similar && !similar.objects.length ? "It looks like no other enrolled object. " : "", job.request.name && h("a", { href: `/object?name=${at(job.request.name)}` }, "Look at it")), h("p", {}, "Put the next object on the table."));
-    else say(job.state === "failed" ? "Not enrolled" : "Interrupted", "unknown", job.error && h("p", {}, `${job.error.detail} `, ...nextSteps(job.error.steps)), job.resume && h("p", {}, h("button", { onclick: () => submit(job.resume) }, job.views || job.request.kind === "tray" ? "Continue" : "Try again")));
+    if (job.question) headline("said", name || "A tray", "calm");
+    else if (job.state === "queued") headline("said", "Waiting for the bench …", "calm");
+    else if (busy) headline("said", name || "Preparing …", "calm", `${job.state === "paused" ? "Paused. " : "Keep your hands off the table. "}${left ? `About ${duration(left)} left.` : ""}`);
+    else if (job.state === "done") headline("said", job.request.kind === "tray" ? "The tray is enrolled" : `${job.request.name} is enrolled`, "found", h("p", {}, similar && !similar.objects.length ? "It looks like no other enrolled object. " : "", job.request.name && h("a", { href: `/object?name=${at(job.request.name)}` }, "Look at it")), h("p", {}, "Put the next object on the table."));
+    else headline("said", job.state === "failed" ? "Not enrolled" : "Interrupted", "unknown", job.error && h("p", {}, `${job.error.detail} `, ...nextSteps(job.error.steps)), job.resume && h("p", {}, h("button", { onclick: () => submit(job.resume) }, job.views || job.request.kind === "tray" ? "Continue" : "Try again")));
     showViews();
     if (job.request.kind === "tray" && objects.length && Object.keys(states).length) showTray(false);
     showSimilar();

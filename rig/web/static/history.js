@@ -1,4 +1,4 @@
-import { $, API, act, ask, at, canOperate, counted, get, h, on, pager, percent, personOf, request, start, table, toast, when } from "./rig.js";
+import { $, API, act, answerWords, ask, at, canOperate, counted, get, h, on, pager, percent, personOf, request, start, table, toast, when } from "./rig.js";
 import { picture } from "./pictures.js";
 
 const RUN_S = 1800; // a search that takes longer than this has no report here
@@ -8,7 +8,6 @@ let runs = [];
 const wanted = new URLSearchParams(location.search).get("result");
 let opened = false;
 
-const words = (one) => ({ found: one.object, ambiguous: `${one.object} or another`, unknown: "unknown object" }[one.outcome] || "no object");
 const kind = (one) => ({ found: "good", ambiguous: "amber", unknown: "amber" }[one.outcome] || "");
 const dateOf = (time) => time.toLocaleDateString("sv"); // year, month and day, of this place
 const day = (one) => dateOf(new Date(one.time_utc));
@@ -28,7 +27,7 @@ function render() {
   $("count").textContent = counted(found.length, "answer");
   table($("answers"), ["", "Answer", "Sample", "Sure", "Views", "Time", "Operator", ""], found.map((one) => [
     one.image ? h("img", { src: `${API}/results/${one.id}/image`, alt: "", loading: "lazy" }) : "",
-    h("span", {}, h("span", { class: `tag ${kind(one)}` }, words(one)), one.corrections > 0 && h("span", { class: "soft small" }, ` corrected, was ${one.answered_object || one.answered_outcome}`)),
+    h("span", {}, h("span", { class: `tag ${kind(one)}` }, answerWords(one)), one.corrections > 0 && h("span", { class: "soft small" }, ` corrected, was ${one.answered_object || one.answered_outcome}`)),
     one.sample || "",
     one.outcome === "found" && one.confidence !== null ? percent(one.confidence) : "",
     one.views,
@@ -55,7 +54,7 @@ async function open(one) {
     one.object ? picture(`${API}/pose-picture?object=${at(one.object)}`, `${one.object} as enrolled`, one.object, " as enrolled") : h("span"));
   const facts = h("p", { class: "small soft" }, [when(one.time_utc), personOf(one.operator), counted(one.views, "view"), one.sample && `sample ${one.sample}`, one.correction_reason && `corrected by ${one.corrected_by}: ${one.correction_reason}`].filter(Boolean).join(", "));
   const links = run ? [h("a", { class: "button", href: `${API}/runs/${run}/report`, target: "_blank" }, "Open the report")] : [];
-  const choice = await ask(`Answer ${one.id}: ${words(one)}`, [pictures, facts, ...links], canOperate() ? [["correct", "Correct it", "quiet"]] : []);
+  const choice = await ask(`Answer ${one.id}: ${answerWords(one)}`, [pictures, facts, ...links], canOperate() ? [["correct", "Correct it", "quiet"]] : []);
   if (choice === "correct") await correct(one);
 }
 

@@ -1,5 +1,5 @@
-import { $, API, act, at, counted, either, followJob, get, h, isEnded, nextSteps, on, percent, showJob, start, update, when } from "./rig.js";
-import { pathDrawing, picture, posePicture, viewPicture } from "./pictures.js";
+import { $, API, act, answerWords, at, counted, either, followJob, get, h, headline, isEnded, nextSteps, on, percent, showJob, start, update, when } from "./rig.js";
+import { pathDrawing, picture, posePicture, thumbs, viewPicture } from "./pictures.js";
 import "./shelf.js";
 
 const SHOWN = 4; // candidates: more are unlikely, and push the steps out of sight
@@ -63,9 +63,9 @@ function take(event, job) {
     case "started": newSearch(); shown = job.request.watch ? shown : null; break;
     case "waiting": search.live = event.reason === "first-object" ? "Put an object on the table." : "Put the next object on the table."; break;
     case "frame_used": s.live = `Looks like ${event.name} …`; break;
-    case "accepted": s.views.push({ number: event.picture, azimuth: event.azimuth_deg }); break;
+    case "accepted": s.views.push(event); break;
     case "ranked": [s.candidates, s.notEnrolled] = [event.candidates, event.decision?.not_enrolled ?? null]; break;
-    case "identified": keep({ ...event, picture: s.views.at(-1)?.number, search: s }, job); break;
+    case "identified": keep({ ...event, search: s }, job); break;
     case "failed": keep({ event: "failed", outcome: "failed", error: event, search: s }, job); break;
     case "recorded": if (ready) act(showLast); break;
     default:
@@ -84,12 +84,6 @@ function keep(answer, job) {
 // -- what is shown --------------------------------------------------------------------------------------------------------
 
 let twinOf = "";
-
-function headline(words, kind, ...detail) {
-  if ($("answer").textContent !== words) $("answer").textContent = words;
-  $("answer").className = `answer ${kind}`;
-  $("answer-detail").replaceChildren(...detail.filter(Boolean));
-}
 
 const enrolledPicture = (one, words) => picture(posePicture(one.name, one.pose_deg), `${one.name} as enrolled, from the same side`, h("strong", {}, one.name), words);
 
@@ -120,17 +114,17 @@ function showAnswer(answer) {
   let after = [];
   if (outcome === "failed") {
     const { error } = answer;
-    headline(error.code === EMPTY_TABLE ? "No object on the table" : "No answer", "unknown", error.code === EMPTY_TABLE ? "The table is empty. " : `${error.detail} `, ...nextSteps(error.steps));
+    headline("answer", error.code === EMPTY_TABLE ? "No object on the table" : "No answer", "unknown", error.code === EMPTY_TABLE ? "The table is empty. " : `${error.detail} `, ...nextSteps(error.steps));
   } else if (outcome === "found") {
     const sure = answer.confidence === null || answer.confidence === undefined ? "" : `${percent(answer.confidence)} sure`;
     const rotated = answer.yaw_deg === null || answer.yaw_deg === undefined ? "" : `, turned by ${answer.yaw_deg.toFixed(0)}°`;
-    headline(answer.name, "found", [sure, time].filter(Boolean).join(", ") + rotated);
+    headline("answer", answer.name, "found", [sure, time].filter(Boolean).join(", ") + rotated);
     pictures = [[candidates[0], `as enrolled, from the same side`]];
   } else if (outcome === "ambiguous") {
-    headline(either(answer.possible.slice(0, 3)), "ambiguous", `The views do not tell them apart (${time}).`);
+    headline("answer", either(answer.possible.slice(0, 3)), "ambiguous", `The views do not tell them apart (${time}).`);
     pictures = answer.possible.slice(0, 2).map((name) => [candidates.find((one) => one.name === name) || { name, pose_deg: 0 }, "as enrolled, from the same side"]);
   } else {
-    headline(outcome === "unknown" ? "Unknown object" : "No object on the table", "unknown", outcome === "unknown" ? `It is none of the enrolled objects (${time}).` : `The table is empty (${time}).`);
+    headline("answer", outcome === "unknown" ? "Unknown object" : "No object on the table", "unknown", outcome === "unknown" ? `It is none of the enrolled objects (${time}).` : `The table is empty (${time}).`);
     if (outcome === "unknown") {
       pictures = candidates.slice(0, 1).map((one) => [one, "looks most like it, but is another object"]);
       after = [h("a", { class: "button", href: "/enroll" }, "Enroll it")];
@@ -152,9 +146,9 @@ function showSearch() {
     h("div", {}, one.name, h("div", { class: "bar c0" }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
   if (s.notEnrolled !== null) rows[s.notEnrolled === best ? "unshift" : "push"](h("li", { title: percent(s.notEnrolled) }, h("span", { class: "none", "aria-hidden": "true" }, "?"), h("div", { class: "soft" }, "none of the enrolled objects", h("div", { class: "bar" }, h("i", { style: `width: ${(100 * s.notEnrolled) / best}%` })))));
   $("candidates").replaceChildren(...rows);
-  $("way").replaceChildren(pathDrawing(s.views.slice(-9).map((view) => view.azimuth)));
+  $("way").replaceChildren(pathDrawing(s.views.slice(-9).map((view) => view.azimuth_deg)));
   $("steps").replaceChildren(...s.steps.slice(-12).map((step) => h("li", { class: step.soft ? "soft" : "" }, step.words)));
-  update($("thumbs"), ...s.views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.number}`, alt: "", loading: "lazy" }), `${view.azimuth.toFixed(0)}°`)));
+  update($("thumbs"), ...thumbs(job, s.views));
   $("notes").replaceChildren(...s.notes.map((words) => h("li", {}, words)));
   $("search").hidden = !s.views.length;
 }
@@ -162,10 +156,9 @@ function showSearch() {
 /** Show the last recorded answers; each leads to its place in the history. */
 async function showLast() {
   const { items } = await get(`/results?limit=${KEPT}`);
-  const words = (one) => (one.outcome === "found" ? one.object : one.outcome === "ambiguous" ? `${one.object} or another` : one.outcome === "unknown" ? "unknown" : "no object");
   $("last-section").hidden = !items.length;
   $("last").replaceChildren(...items.map((one) => h("li", {}, h("a", { href: `/runs?result=${one.id}` },
-    one.image && h("img", { src: `${API}/results/${one.id}/image`, alt: "" }), words(one), one.sample && h("span", { class: "soft" }, ` ${one.sample}`), h("br"), h("span", { class: "soft" }, when(one.time_utc))))));
+    one.image && h("img", { src: `${API}/results/${one.id}/image`, alt: "" }), answerWords(one), one.sample && h("span", { class: "soft" }, ` ${one.sample}`), h("br"), h("span", { class: "soft" }, when(one.time_utc))))));
 }
 
 let job = null;
@@ -175,13 +168,13 @@ function redraw() {
   $("go").disabled = !idle && !job.request.watch;
   showJob($("job"), job, false);
   if (shown) showAnswer(shown);
-  else if (isEnded(job)) headline("Stopped", "calm", "No answer. Nothing was recorded.");
+  else if (isEnded(job)) headline("answer", "Stopped", "calm", "No answer. Nothing was recorded.");
   else {
     $("enrolled").hidden = true;
     $("after").replaceChildren();
     compare();
-    if (job.state === "queued") headline("Waiting for the bench …", "calm");
-    else if (!idle) headline(search.live && !search.views.length ? search.live : "Searching …", "calm", search.steps.at(-1)?.words || "");
+    if (job.state === "queued") headline("answer", "Waiting for the bench …", "calm");
+    else if (!idle) headline("answer", search.live && !search.views.length ? search.live : "Searching …", "calm", search.steps.at(-1)?.words || "");
   }
   if (shown && job.request.watch && !idle) $("answer-detail").append(h("p", {}, h("strong", {}, search !== shown.search && search.views.length ? "Searching the next object …" : search.live)));
   showSearch();

@@ -9,6 +9,9 @@ export function picture(source, alt, ...words) {
   return h("figure", {}, h("div", { class: "frame" }, h("img", { src: source, alt })), words.length > 0 && h("figcaption", {}, ...words));
 }
 
+/** Return the pictures of the views that a job has taken so far, as the entries of a list. */
+export const thumbs = (job, views) => views.map((view) => h("li", {}, h("img", { src: `${API}/jobs/${job.id}/views/${view.picture}`, alt: "", loading: "lazy" }), `${view.azimuth_deg.toFixed(0)}°`));
+
 /** Return for each of some objects where an object and it look most alike, and where they differ most. */
 export async function comparisons(name, others) {
   const side = (view, azimuth, of, words) => picture(viewPicture(view), `${of} at ${azimuth.toFixed(0)}°`, words);

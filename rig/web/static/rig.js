@@ -561,6 +561,16 @@ export function listJobs(changed) {
   });
 }
 
+/** Say in the large words of a page how its job is, with details below. Words that stay are not announced again. */
+export function headline(id, words, kind, ...detail) {
+  if ($(id).textContent !== words) $(id).textContent = words;
+  $(id).className = `answer ${kind}`;
+  $(`${id}-detail`).replaceChildren(...detail.filter(Boolean));
+}
+
+/** Return a recorded answer in words, after its corrections. */
+export const answerWords = ({ outcome, object }) => ({ found: object, ambiguous: `${object} or another`, unknown: "unknown object" }[outcome] || "no object");
+
 /** Return a function that loads a list from its beginning. `add` gets its pages; the button #more loads the next one. */
 export function pager(path, add) {
   let next = null;
