@@ -1,8 +1,6 @@
 """Jobs on the simulated bench through the REST API."""
 
-import asyncio
 import json
-import threading
 from dataclasses import replace
 from inspect import signature
 from typing import Any, get_args
@@ -227,25 +225,6 @@ def test_program_over_http_repeats_its_request_and_follows_the_stream_of_events(
     assert (sent.headers["content-type"], seen[-1]["id"]) == ("text/event-stream; charset=utf-8", answer.json()["id"])
     assert [one.get("event") for one in seen].count("enrolled") == 1
     assert len(served.worker.queue.jobs()) == 1
-
-
-async def first_event(stream):
-    return await anext(stream)
-
-
-def test_events_continue_after_the_last_one_that_was_received(serve):
-    served = serve("bench.sim.object='lamp'")
-    threads = threading.active_count()
-    start = asyncio.run(first_event(served.server.hub.stream())).split()[1]
-    served.run(kind="enroll", name="lamp", views=4)
-    number, lost = served.server.hub.position(start)
-    messages, missing = served.server.hub.since(number)
-    accepted = [json.loads(one.data) for one in messages if one.kind == "plan" and '"accepted"' in one.data]
-    assert not lost
-    assert not missing
-    assert [one["picture"] for one in accepted] == [0, 1, 2, 3]
-    while threading.active_count() > threads:  # those of requests end soon; one that stays runs into the timeout
-        SystemClock().sleep(0.005)
 
 
 def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
