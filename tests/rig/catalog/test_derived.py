@@ -283,7 +283,7 @@ def test_a_catalog_with_learned_descriptions_is_searched_without_the_weights(
     learned = FULL
     with monkeypatch.context() as patch:
         patch.setattr(network, "weights_file", lambda: Path("weights"))
-        patch.setattr(network, "_NET", lambda planes: planes[:, :1, 105:119, 105:119].repeat(112, axis=1))
+        patch.setattr(network, "_NET", lambda frame: frame[105:119, 105:119, :1].repeat(112, axis=2))
         views, described = load(catalog, learned)
     assert (len(views), described) == (len(NAMES) * VIEWS, len(NAMES))
     monkeypatch.setattr(network, "weights_file", lambda: None)
