@@ -37,40 +37,23 @@ def begin(catalog: Catalog, name: str, views: int = 3, **options: object) -> Ope
     return catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **options)  # type: ignore[arg-type]
 
 
-@examples(7)
-@given(
-    name=NAMES.filter(lambda name: clean_name(name) == name),
-    commanded_deg=ANGLES,
-    encoder_deg=ANGLES,
-    azimuth_deg=st.floats(0, 360, exclude_max=True),
-    imu=st.none() | st.tuples(ANGLES, st.floats(0, 10)),
-    captured_ns=st.integers(0, 2**62),
-    evidence=EVIDENCE,
-    image_bgr=IMAGES,
-)
-def test_view_is_read_as_it_was_stored(
-    name: str,
-    commanded_deg: float,
-    encoder_deg: float,
-    azimuth_deg: float,
-    imu: tuple[float, float] | None,
-    captured_ns: int,
-    evidence: dict[str, object],
-    image_bgr: np.ndarray,
-) -> None:
-    imu_deg, imu_sigma_deg = imu or (None, None)
-    clock = VirtualClock()
-    clock.advance_to(captured_ns)
-    values = {
-        "index": 0,
-        "commanded_deg": commanded_deg,
-        "encoder_deg": encoder_deg,
-        "azimuth_deg": azimuth_deg,
-        "captured_ns": captured_ns,
-        "imu_deg": imu_deg,
-        "imu_sigma_deg": imu_sigma_deg,
-        "evidence": evidence,
+VALUES = st.fixed_dictionaries(
+    {
+        **dict.fromkeys(("commanded_deg", "encoder_deg"), ANGLES),
+        "azimuth_deg": st.floats(0, 360, exclude_max=True),
+        "captured_ns": st.integers(0, 2**62),
+        "evidence": EVIDENCE,
     }
+)
+IMU = st.tuples(st.none(), st.none()) | st.tuples(ANGLES, st.floats(0, 10))
+
+
+@examples(7)
+@given(name=NAMES.filter(lambda name: clean_name(name) == name), values=VALUES, imu=IMU, image_bgr=IMAGES)
+def test_view_is_read_as_it_was_stored(name: str, values: dict[str, Any], imu: Any, image_bgr: np.ndarray) -> None:
+    clock = VirtualClock()
+    clock.advance_to(values["captured_ns"])
+    values = {"index": 0, **values, "imu_deg": imu[0], "imu_sigma_deg": imu[1]}
     with TemporaryDirectory() as folder:
         with Catalog.open(folder, clock=clock) as catalog:
             enrollment = begin(catalog, name, views=1)
@@ -88,7 +71,7 @@ def test_view_is_read_as_it_was_stored(
     assert [one.provenance for one in found.complete.sessions] == [PROVENANCE]
     assert model.object_names == (name,)
     assert np.array_equal(model.descriptors, hbr.describe(image_bgr[::-1])[None])
-    assert model.azimuth_deg.tolist() == [azimuth_deg]
+    assert model.azimuth_deg.tolist() == [values["azimuth_deg"]]
 
 
 def test_views_are_ordered_by_object_and_index(catalog: Catalog) -> None:

@@ -66,17 +66,14 @@ def test_missing_catalog_is_not_created_unasked(tmp_path: Path, create: bool, re
     assert not (tmp_path / "nothing").exists()
 
 
-def test_files_of_another_kind_are_rejected(tmp_path: Path) -> None:
+def test_files_of_another_kind_are_rejected_and_not_changed(tmp_path: Path) -> None:
     file = tmp_path / "catalog.sqlite"
     file.write_text("dear diary\n" * 100)
     with pytest.raises(CatalogError, match="is a file"):
         open_catalog(file)
     with pytest.raises(CatalogError, match="not a catalog"):
         open_catalog(tmp_path)
-
-
-def test_database_of_another_program_is_not_changed(tmp_path: Path) -> None:
-    file = tmp_path / "catalog.sqlite"
+    file.unlink()
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("CREATE TABLE bookmarks (url)")
     before = file.read_bytes()

@@ -53,9 +53,14 @@ class TestEdit:
         assert names(catalog) == ["cup", "tin"]
         assert catalog.object("cup").summary.views == 2
 
-    def test_enrollment_continues_under_the_new_name(self, catalog: Catalog) -> None:
+    def test_enrollment_continues_under_the_new_name_unless_its_object_is_deleted(self, catalog: Catalog) -> None:
         enrollment = catalog.begin("mug", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
         enrollment.add(record(0), image(0))
+        catalog.delete("mug")
+        with pytest.raises(CatalogError, match="deleted during") as error:
+            enrollment.add(record(1), image(1))
+        assert Do.UNDELETE(name="mug") in error.value.steps
+        catalog.undelete("mug")
         catalog.rename("mug", "cup")
         enrollment.add(record(1), image(1))
         enrollment.finish()
@@ -72,16 +77,6 @@ class TestEdit:
         assert len(catalog.objects(deleted=True)) == 2
         catalog.undelete("mug")  # the one that was deleted last
         assert catalog.object("mug").summary.views == 2
-
-    def test_enrollment_of_a_deleted_object_is_rejected(self, catalog: Catalog) -> None:
-        enrollment = catalog.begin("mug", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
-        enrollment.add(record(0), image(0))
-        catalog.delete("mug")
-        with pytest.raises(CatalogError, match="deleted during") as error:
-            enrollment.add(record(1), image(1))
-        assert Do.UNDELETE(name="mug") in error.value.steps
-        catalog.undelete("mug")
-        enrollment.add(record(1), image(1))
 
 
 class TestLog:
