@@ -7,6 +7,7 @@ Decision: docs/decisions/0011.
 
 import json
 import shutil
+from collections import defaultdict
 from collections.abc import Collection
 from contextlib import suppress
 from datetime import datetime
@@ -20,17 +21,17 @@ from sqlalchemy.orm import Session as Transaction
 from rig.catalog import derived
 from rig.catalog.catalog import Catalog
 from rig.catalog.database import properties
-from rig.catalog.facts import Property
+from rig.catalog.facts import Derived, Property
 from rig.catalog.images import Images
 from rig.catalog.jobs import finished
-from rig.catalog.transfer import CatalogSource, transfer
+from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, CatalogUnavailable
 from rig.core.files import json_values
 
 _COPY: Final = "copy"
-"""Property of a local copy: of which catalog and version it is, and when it was made."""
+"""Property of a local copy: of which catalog it is, and when it was made."""
 _PATIENCE: Final = 20  # a server that is away costs one wait in twenty-one times that long
 
 
@@ -102,7 +103,7 @@ def open_or_copy(
 
 
 def _about(transaction: Transaction) -> dict[str, Any]:
-    """Return what a local copy is of: place, id and version of the catalog, and the time."""
+    """Return what a local copy is of: place and id of the catalog, and the time."""
     stored = transaction.scalar(select(Property.value).where(Property.key == _COPY))
     with suppress(ValueError, TypeError):
         return dict(json_values((stored or "").encode()))
@@ -110,37 +111,64 @@ def _about(transaction: Transaction) -> dict[str, Any]:
 
 
 def update_copy(catalog: Catalog) -> bool:
-    """Bring the local copy up to date; return whether it was made again.
+    """Bring the local copy up to date; return whether anything had changed.
 
-    It is made as a whole, because what searches read changes seldom, and then takes the place of the former one. A copy
-    that is damaged, or of another catalog, is made again, too.
+    Only new and deleted objects are brought over. A copy that is damaged, of another catalog, or different in another
+    way (an object has another name, or was described again) is made again and takes the place of the former one.
 
     Raises `CatalogDamaged`: the catalog is not as it was stored; the copy stays as it is. `CatalogError`: one of them
     cannot be used.
     """
     place, clock = catalog.place, catalog.clock
-    with catalog.reading() as state:
-        about = {"catalog": str(place), "id": properties(state.transaction)["id"], "version": state.version()}
-    is_same = False
-    with suppress(CatalogError), open_copy(place, clock) as copy, copy.database.read() as transaction:
-        is_same = about.items() <= _about(transaction).items() and copy.version() == about["version"]
-    about["copied_utc"] = clock.utc().isoformat()
-    if is_same:
+    theirs = _searched(catalog)
+    with catalog.database.read() as transaction:
+        about = {"catalog": str(place), "id": properties(transaction)["id"]}
+    own = about | {"copied_utc": clock.utc().isoformat()}
+    # Bring the present copy up to date.
+    with suppress(CatalogError):
+        open_copy(place, clock).close()
         with Catalog.open(place.copy_folder, clock=clock) as copy:
-            _sign(copy, about)
-        return False
+            with copy.database.read() as transaction:
+                is_of_it = about.items() <= _about(transaction).items()
+            ours = _searched(copy)
+            if is_of_it and ours != theirs:
+                copy.delete(*(ours.keys() - theirs.keys()))
+                if changed := [name for name, found in theirs.items() if ours.get(name) != found]:
+                    _fill(copy, CatalogSource(catalog, changed))
+            if is_of_it and list(_searched(copy).items()) == list(theirs.items()):  # in the same order
+                _sign(copy, own)
+                return ours != theirs
+    # Make another one.
     with catalog.database.catalog_errors(), TemporaryDirectory(prefix=".copy-", dir=place.path) as folder:
         with Catalog.open(Path(folder, place.copy_folder.name), clock=clock) as made:
-            made.database.images = _NoImages(made.path)
-            finished(transfer(CatalogSource(catalog), made, once=True))
-            newest = derived.empty_tables(made).newest
-            with suppress(CatalogError):  # rig catalog verify reports it
-                if newest is not None:
-                    Images(made.path).put(catalog.database.images.content(newest))
-            _sign(made, about)
+            _fill(made, CatalogSource(catalog))
+            _sign(made, own)
         shutil.rmtree(place.copy_folder, ignore_errors=True)
         made.path.rename(place.copy_folder)
     return True
+
+
+def _searched(catalog: Catalog) -> dict[str, tuple[object, ...]]:
+    """Return what searches read of each object by its name: texts, seal, and digests of what is computed from it."""
+    with catalog.reading() as state:
+        computed = defaultdict[str, list[object]](list)
+        columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.sha256)
+        for seal, *row in state.transaction.execute(columns.order_by(Derived.seal, Derived.what)):
+            computed[seal].append(row)
+        texts = {line.object_id: (line.label or "", line.note or "") for line in state.in_use()}
+        return {one.name: (*texts[one.object_id], one.seal, computed.get(one.seal)) for one in state.used(checked=True)}
+
+
+def _fill(copy: Catalog, source: CatalogSource) -> None:
+    """Transfer objects into the local copy without their images, but with the newest one of the empty table."""
+    store, copy.database.images = copy.database.images, _NoImages(copy.path)
+    finished(transfer(source, copy, conflict=Conflict.REPLACE, once=True))
+    copy.database.images, newest = store, derived.empty_tables(copy).newest
+    with copy.database.catalog_errors():
+        if newest is not None and not store.size(newest):
+            with suppress(CatalogError):  # rig catalog verify reports it
+                store.put(source.content(newest))
+        store.remove(store.names() - {newest})
 
 
 def _sign(copy: Catalog, about: dict[str, Any]) -> None:
