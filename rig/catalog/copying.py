@@ -167,7 +167,7 @@ def _fill(copy: Catalog, source: CatalogSource) -> None:
     with copy.database.catalog_errors():
         if newest is not None and not store.size(newest):
             with suppress(CatalogError):  # rig catalog verify reports it
-                store.put(source.content(newest))
+                store.put(source.catalog.database.images.content(newest))
         store.remove(store.names() - {newest})
 
 
