@@ -87,6 +87,11 @@ def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace) -> None
         assert update_copy(catalog)
         with same_copy(place, catalog) as copy:
             assert derived.views(copy).object_names == ("cup", "tin")
+        fill(catalog, "jar", 1, 40)
+        expected = derived.views(catalog, "cedd-blurred")  # another program describes the views in another way
+        assert update_copy(catalog)
+        with same_copy(place, catalog) as copy:
+            assert derived.views(copy, "cedd-blurred").packed().tolist() == expected.packed().tolist()
 
 
 def test_damaged_copy_and_copy_of_another_catalog_are_made_again(
