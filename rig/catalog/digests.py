@@ -1,8 +1,6 @@
 """Comparison of the digests of many rows, as the database stores them: without making objects of them."""
 
 from collections.abc import Iterator, Mapping
-from itertools import groupby
-from operator import itemgetter
 from typing import Any, Final
 
 from sqlalchemy import (
@@ -31,32 +29,25 @@ AT_ONCE: Final = 100
 
 def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None]) -> Iterator[int]:
     """Yield which of these enrollments, by their ids and seals, are not as they were written."""
-    enrollments, views = Enrollment.__table__.c, View.__table__.c
     is_postgres = transaction.get_bind().dialect.name == "postgresql"
     for part in portions(sorted(seals), AT_ONCE):
-        own = {
-            row[0]: row[1:]
-            for row in transaction.execute(
-                select(Enrollment.id, Enrollment.digest, Enrollment.key, *_raw(is_postgres, Enrollment)).where(
-                    enrollments.id.in_(part)
-                )
-            )
-        }
-        keys = {number: str(row[1]) for number, row in own.items()}
-        digests = {number: [row[0]] for number, row in own.items()}
-        wrong = {number for number, row in own.items() if row[0] != sha256_of((keys[number], *row[2:]))}
-        for table, order in ((Session, Session.number), (View, views.view_index)):
-            rows = transaction.execute(
-                select(table.enrollment_id, table.digest, *_raw(is_postgres, table))
-                .where(table.enrollment_id.in_(part))
-                .order_by(table.enrollment_id, order)
-            )
-            for number, group in groupby(rows, itemgetter(0)):
-                for row in group:
-                    digests[number].append(row[1])
-                    if row[1] != sha256_of((keys[number], *row[2:])):
-                        wrong.add(number)
-        wrong |= {number for number in own if seals[number] not in (None, sha256_of(tuple(digests[number])))}
+        keys: dict[int, str] = dict(
+            transaction.execute(select(Enrollment.id, Enrollment.key).where(Enrollment.id.in_(part))).all()
+        )
+        digests: dict[int, list[str]] = {number: [] for number in keys}
+        wrong = set()
+        # In the order of a seal: the enrollment, its sessions, its views.
+        for table, owner, order in (
+            (Enrollment, Enrollment.id, Enrollment.id),
+            (Session, Session.enrollment_id, Session.number),
+            (View, View.enrollment_id, View.index),
+        ):
+            columns = select(owner, table.digest, *_raw(is_postgres, table))
+            for number, found, *row in transaction.execute(columns.where(owner.in_(part)).order_by(owner, order)):
+                digests[number].append(found)
+                if found != sha256_of((str(keys[number]), *row)):
+                    wrong.add(number)
+        wrong |= {number for number, own in digests.items() if seals[number] not in (None, sha256_of(tuple(own)))}
         yield from sorted(wrong)
 
 
