@@ -6,20 +6,29 @@ import pytest
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.model.symmetry import SimilarObject
+from rig.core.errors import NoObject
 from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.events.events import (
     Candidate,
     Decided,
+    Event,
+    Failed,
     FrameUsed,
     Identified,
     Moved,
     Note,
     NoteCode,
+    ObjectChanged,
     Ranked,
     RotationReason,
+    ScanStarted,
     SimilarObjects,
+    Unwinding,
     Verified,
+    Waiting,
+    WaitReason,
+    Warned,
     Weighed,
 )
 from rig.events.wording import (
@@ -35,6 +44,7 @@ from rig.events.wording import (
     similar_object_words,
     verification_words,
 )
+from rig.motion.scan_speed import SpeedLimit
 from tests.rig.report.report_samples import NAMES, NOTE, identified
 
 
@@ -152,6 +162,7 @@ def test_similar_objects_are_put_into_words() -> None:
     assert line(replace(vase, period_deg=None)) == "  looks like no other enrolled object"
 
 
+NO_OBJECT = NoObject("The table is empty.", next_step="Put the object on it.")
 AT_HOME, ALL, MANY = ((359.7, 0.3),), ((0.0, 360.0),), tuple((float(a), a + 10.0) for a in (0, 30, 60, 90))
 
 
@@ -180,6 +191,25 @@ def test_move_is_put_into_words() -> None:
     slipped = replace(move, agrees=False, rotation_imu_deg=-80.0)
     assert move_words(slipped).endswith("they differ by more than 0.60°, so the gyro value counts")
     assert move_words(replace(move, rotation_imu_deg=None)).endswith("no gyro value")
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        (ScanStarted(90.0, SpeedLimit.SMEAR, 4.0, 0.0, 360.0), "from 0.0° to 360.0°: 4 ms exposure allows 90 °/s"),
+        (Unwinding(0, 330.0, -30.0, 1, (-400.0, 400.0)), "from 330.0° back to −30.0° (the cable allows −400° to 400°)"),
+        (ObjectChanged(3, 3, 7.5, 3.0), "begins again with view 4 (evidence 7.5, needed 3.0)."),
+        (ObjectChanged(3, 2, 7.5, 3.0), "begins again with views from 3 on (evidence"),
+        (Waiting(WaitReason.NEXT_OBJECT), "Waiting for the next object; Ctrl+C ends."),
+        (
+            Warned(3, Note(NoteCode.TABLE_DIFFERS, {"taken_utc": "noon"})),
+            "may be on it.\nNext step: Check that the table",
+        ),
+        (Failed(NO_OBJECT.problem), "Error 606 (no object): The table is empty.\nNext step: Put the object on it."),
+    ],
+)
+def test_each_event_is_a_line(event: Event, words: str) -> None:
+    assert words in line(event)
 
 
 def test_not_enrolled_is_one_more_candidate() -> None:
