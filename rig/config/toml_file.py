@@ -154,6 +154,7 @@ def stated(key: Key, value: Any) -> str:
 
 def _edited(text: str, key: Key, value: Any) -> str:
     """Return the document with the line of a key replaced or inserted; the caller checks that it is right."""
+    # Where the table of the key begins; a new one goes to the end of the file.
     lines = StringIO(text, newline="").readlines()
     new = f"{_written(key[-1:])} = {stated(key, value)}"
     headers = [at for at, line in enumerate(lines) if _HEADER.fullmatch(line.rstrip())]

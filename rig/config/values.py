@@ -17,7 +17,7 @@ from rig.core.next_steps import Do
 
 M = TypeVar("M", bound=BaseModel)
 
-APP = "hbr-rig"
+APP = "hbr-rig"  # folder of the program below the user's folders
 FILE_NAME = "rig.toml"
 MAX_VALUE_LENGTH = 2000  # longer than any path or list of the configuration
 SHOWN = 60  # a longer value fills the terminal, and its start shows which one it is

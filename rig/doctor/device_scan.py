@@ -176,6 +176,7 @@ class DeviceScan:
             except DeviceNotFound as error:
                 yield of_error(error)
                 continue
+            # Its mode before anyone sets one, and what it offers.
             width, height = (round(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
             fps, modes = capture.get(cv2.CAP_PROP_FPS), capture.modes()
             capture.release()

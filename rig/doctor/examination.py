@@ -113,6 +113,7 @@ def run_checks(
             progress("")
             if item is None:
                 break
+            # A finding does not know its check, nor the options that select this bench.
             steps = tuple(step if isinstance(step, str) else context.step(step) for step in item.steps)
             code = item.exit_code or (check.exit_code if item.level is Severity.BAD else 0)
             yield replace(item, steps=steps, topic=item.topic or check.topic, exit_code=code)

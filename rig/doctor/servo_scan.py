@@ -93,11 +93,12 @@ def scan_servos(
             except (ValueError, NotImplementedError):  # the adapter does not support this rate
                 continue
             scans.append(_scan(port, baud))
-            if scans[-1].duplicate_ids:
+            if scans[-1].duplicate_ids:  # nothing can be set before one of the two is unplugged
                 return scans
     finally:
         with suppress(serial.SerialException, OSError, ValueError):
             wire.baudrate = before
+    # Equal answers at every rate are echoes of one; few rates prove nothing.
     answers = {frozenset((servo.bus_id, servo.model_number, servo.firmware) for servo in each.servos) for each in scans}
     if len(scans) < 3 or len(answers) > 1 or not scans[0].servos:
         return scans
@@ -105,6 +106,7 @@ def scan_servos(
 
 
 def _scan(port: ClockedPort, baud: int) -> BaudScan:
+    # Who answers to a broadcast, and how many bytes come.
     listening = _Recording(port)
     try:
         answers, _ = Protocol2PacketHandler().broadcastPing(listening)
@@ -117,7 +119,7 @@ def _scan(port: ClockedPort, baud: int) -> BaudScan:
         FoundServo(bus_id, baud, model_of(number), number, firmware)
         for bus_id, (number, firmware) in sorted(answers.items())
     ]
-    bus = DynamixelBus(port, retries=0)
+    bus = DynamixelBus(port, retries=0)  # a repetition would hide a collision
     duplicate_ids = [servo.bus_id for servo in servos if _collides(bus, servo.bus_id, servo.model)]
     # The SDK skips what it cannot read, and reports success. Answers of servos with the same id collide: if more bytes
     # came than belong to complete answers, ask each id separately.
