@@ -75,14 +75,7 @@ class SearchResult:
 
 @dataclass(frozen=True, eq=False)
 class EnrolledViews:
-    """The enrolled views of an object.
-
-    Attributes
-    ----------
-    levels : uint8 array (n, length)
-    azimuth_deg : float64 array (n,)
-    cut_outs : tuple of LocalView
-    """
+    """The enrolled views of an object: levels uint8 (n, length), azimuths (n,), and what was cut out."""
 
     levels: LevelArray
     azimuth_deg: NDArray[np.float64]

@@ -17,17 +17,9 @@ _RESAMPLES: Final = 2000
 
 
 def wilson(hits: int, trials: int) -> tuple[float, float]:
-    """Return Wilson's 95 % score interval of a proportion.
+    """Return Wilson's 95 % score interval of a proportion, around ``hits / trials`` and within 0..1.
 
-    Parameters
-    ----------
-    hits, trials : int
-        0 <= hits <= trials, trials >= 1.
-
-    Returns
-    -------
-    low, high : float
-        The interval around ``hits / trials``, within 0..1.
+    Raises `ValueError`: there is no trial, or hits are not within 0..trials.
 
     Source: E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22 (1927) 209.
     """
@@ -45,10 +37,7 @@ def wilson(hits: int, trials: int) -> tuple[float, float]:
 def mcnemar_exact(only_first: int, only_second: int) -> float:
     """Return the two-sided exact p-value of McNemar's test; 1 if the methods differ in no trial.
 
-    Parameters
-    ----------
-    only_first, only_second : int
-        Trials that only the first or only the second method hit.
+    The arguments count the trials that only the first, or only the second method hit.
     """
     if only_first < 0 or only_second < 0:
         raise ValueError(f"{only_first} and {only_second} discordant trials; counts cannot be negative")
@@ -61,19 +50,9 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
 def bootstrap_difference(first: Hits, second: Hits, rng: np.random.Generator) -> tuple[float, float]:
     """Return the 95 % percentile interval of the difference of two hit rates, by resampling complete objects.
 
-    The trials of one object are similar: an interval for independent trials would be too narrow.
-
-    Parameters
-    ----------
-    first, second : bool array (objects, trials)
-        Hits on the same trials.
-    rng : numpy Generator
-        Draws the objects.
-
-    Returns
-    -------
-    low, high : float
-        The interval of ``first.mean() - second.mean()``.
+    The trials of one object are similar: an interval for independent trials would be too narrow. ``first`` and
+    ``second``, bool (objects, trials), are hits on the same trials; the interval is that of
+    ``first.mean() - second.mean()``.
     """
     if first.shape != second.shape or first.ndim != 2 or not first.size:
         raise ValueError(f"hits of shapes {first.shape} and {second.shape}; one (objects, trials) for both is needed")

@@ -119,17 +119,29 @@ def run_object(
     ValueError
         The object has too few views, or the number of queries is another one.
     """
-    trial = _Trials(object_index, queries, views, protocol, now_ns, photographs)
-    runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
+    trials = _Trials(object_index, queries, views, protocol, now_ns, photographs)
+    trials.runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
     for t in range(protocol.trials):
-        draws = trial.draw(t)
-        models: dict[bytes, _Model] = {}
+        draws = trials.draw(t)
+        trials.models = {}  # those of other trials are seldom the same
         for m, method in enumerate(methods):
-            trial.run(method, draws, models, runs, (m, 0, t))
-    return runs
+            trials.run(method, draws, (m, 0, t))
+    return trials.runs
+
+
+At = tuple[int, int, int]
+"""Method, object and trial: where the results of a trial belong in `Runs`."""
 
 
 class _Trials:
+    """The trials of one object, with all that its trials share.
+
+    Before `run`: ``runs`` takes the results, ``models`` keeps the enrolled views of a trial by those that stay.
+    """
+
+    runs: Runs
+    models: dict[bytes, _Model]
+
     def __init__(
         self,
         object_index: int,
@@ -178,20 +190,18 @@ class _Trials:
             error_deg = np.cumsum(rng.choice(measured_deg, count))
         return _Draws(order, error_deg, coins)
 
-    def run(
-        self, method: Method, draws: _Draws, models: dict[bytes, _Model], runs: Runs, at: tuple[int, int, int]
-    ) -> None:
+    def run(self, method: Method, draws: _Draws, at: At) -> None:
         """Store the results of one trial with one method in `runs`."""
         if method.dense:
-            self._run_dense(method, draws, runs, at)
+            self._run_dense(method, draws, at)
             return
         if method.hmm:
-            self._run_hmm(method, draws, models, runs, at)
+            self._run_hmm(method, draws, at)
             return
-        last = self._last(method)
-        for n, seen, keep, measured_deg in self._queries_of(draws, last, runs, at):
+        runs, last = self.runs, self._last(method)
+        for n, seen, keep, measured_deg in self._queries_of(draws, last, at):
             # a new index for each method: lists of another method would shorten the measured time
-            model = self._model(keep, models)
+            model = self._model(keep)
             # Only the first repetition is timed; the others may share lists.
             is_measured = at[2] == 0
             index = ViewIndex(model.views)
@@ -209,15 +219,15 @@ class _Trials:
             planned_deg = self._planned_deg(method, draws, seen, ranking) if n + 1 < last else None
             following = self._next(draws, seen, planned_deg, last)
             runs.step_ns[*at, n] = self._now_ns() - start_ns if is_measured else 0
-            self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
-            self._record_margin(ranking, seen, keep, runs, (*at, n))
+            self._record(ranking.object_index, ranking.pose_deg, seen, (*at, n))
+            self._record_margin(ranking, seen, keep, (*at, n))
             seen.append(following)
 
     def _last(self, method: Method) -> int:
         return min(self._protocol.max_views, method.views or self._protocol.max_views)
 
     def _queries_of(
-        self, draws: _Draws, last: int, runs: Runs, at: tuple[int, int, int]
+        self, draws: _Draws, last: int, at: At
     ) -> Iterator[tuple[int, list[int], NDArray[np.bool_], FloatArray]]:
         """Yield after each query its number, all queries so far, which own views stay, and all measured orientations.
 
@@ -226,7 +236,7 @@ class _Trials:
         seen = [int(draws.order[0])]
         travelled_deg = 0.0
         for n in range(last):
-            runs.travelled_deg[*at, n] = travelled_deg
+            self.runs.travelled_deg[*at, n] = travelled_deg
             yield n, seen, self._keep(np.array(seen)), self._azimuth_deg[seen] + draws.error_deg[: n + 1]
             travelled_deg += abs(float(wrap180(self._azimuth_deg[seen[-1]] - self._azimuth_deg[seen[-2]])))
 
@@ -240,12 +250,10 @@ class _Trials:
             rows = nearest[model.mask[nearest]][:list_length]
             index.remember(self._queries[i], model.place(rows), self._similar[i, rows])
 
-    def _run_hmm(
-        self, method: Method, draws: _Draws, models: dict[bytes, _Model], runs: Runs, at: tuple[int, int, int]
-    ) -> None:
-        last = self._last(method)
-        for n, seen, keep, measured_deg in self._queries_of(draws, last, runs, at):
-            chosen = self._model(keep, models)
+    def _run_hmm(self, method: Method, draws: _Draws, at: At) -> None:
+        runs, last = self.runs, self._last(method)
+        for n, seen, keep, measured_deg in self._queries_of(draws, last, at):
+            chosen = self._model(keep)
             model = PoseModel(chosen.views)
             _ = model.compared  # an index is not built in the measured time
             similar = self._similar[seen][:, chosen.mask]
@@ -259,19 +267,19 @@ class _Trials:
             following = self._next(draws, seen, planned_deg, last)
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             objects, log_probability, pose_deg = belief.ranking()
-            self._record(objects, pose_deg, seen, runs, (*at, n))
+            self._record(objects, pose_deg, seen, (*at, n))
             leading = np.exp(log_probability[:2])
             runs.score[*at, n] = leading[0]
             runs.margin[*at, n] = leading[0] - leading[1:].sum()
             runs.outcome[*at, n] = OUTCOMES.index(Outcome.FOUND if leading[0] >= CONFIDENT else Outcome.CONTINUE)
             seen.append(following)
 
-    def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
+    def _run_dense(self, method: Method, draws: _Draws, at: At) -> None:
         index = _index_of_trial(self._views, self._protocol, method.omega)
-        last = self._last(method)
+        runs, last = self.runs, self._last(method)
         session = DenseSession(index, max_views=last, most_changes=0)
         ended = False
-        for n, seen, keep, measured in self._queries_of(draws, last, runs, at):
+        for n, seen, keep, measured in self._queries_of(draws, last, at):
             # Views near the newest query leave the model for the earlier queries, too.
             gone = self._rows[~keep & self._enrolled[self._rows]]
             measured_deg = measured.tolist()
@@ -289,12 +297,12 @@ class _Trials:
             ranking = session.belief.ranking()
             objects = ranking.object_index.tolist()
             pose_deg = [azimuth_of(session.belief, j) if j == self._object else np.nan for j in objects]
-            self._record(ranking.object_index, np.array(pose_deg), seen, runs, (*at, n))
+            self._record(ranking.object_index, np.array(pose_deg), seen, (*at, n))
             # The numbers after this view; until the first end, pixels count, too.
             runs.score[*at, n] = ranking.scores[0]
             runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
             if not ended:
-                self._verify(session, seen, measured_deg)
+                self._verify(session, seen, measured_deg, keep)
             runs.named[*at, n] = session.decision.object_index == self._object
             runs.outcome[*at, n] = OUTCOMES.index(session.decision.outcome)
             if not ended and session.decision.outcome is not Outcome.CONTINUE:
@@ -304,12 +312,13 @@ class _Trials:
                 runs.stated[*at, n] = stated_pose(stated, true_deg, self._azimuth_deg[keep])
             seen.append(following)
 
-    def _verify(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> None:
+    def _verify(
+        self, session: DenseSession, seen: list[int], measured_deg: list[float], keep: NDArray[np.bool_]
+    ) -> None:
         """Compare pixels as on the bench."""
         photographs = self._photographs
         if photographs is None:
             return
-        keep = self._keep(np.array(seen))
 
         def queries(n: int) -> list[LocalView]:
             return [photographs.query(self._object, seen[n], measured_deg[n])]
@@ -363,14 +372,14 @@ class _Trials:
             )
         return keep
 
-    def _model(self, keep: NDArray[np.bool_], models: dict[bytes, _Model]) -> _Model:
+    def _model(self, keep: NDArray[np.bool_]) -> _Model:
         """Return the enrolled views; of the searched object, only those that stay."""
         key = keep.tobytes()
-        if key not in models:
+        if key not in self.models:
             mask = self._enrolled.copy()
             mask[self._rows] = keep
-            models[key] = _Model(self._views.select(mask), mask, np.flatnonzero(~mask))
-        return models[key]
+            self.models[key] = _Model(self._views.select(mask), mask, np.flatnonzero(~mask))
+        return self.models[key]
 
     def _planned_deg(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> float | None:
         if method.active and len(seen) > 1:
@@ -394,10 +403,8 @@ class _Trials:
         away_deg[seen] = np.inf
         return int(away_deg.argmin())
 
-    def _record(
-        self, objects: IndexArray, pose_deg: FloatArray, seen: list[int], runs: Runs, at: tuple[int, int, int, int]
-    ) -> None:
-        place = np.flatnonzero(objects == self._object)
+    def _record(self, objects: IndexArray, pose_deg: FloatArray, seen: list[int], at: tuple[int, ...]) -> None:
+        runs, place = self.runs, np.flatnonzero(objects == self._object)
         runs.rank[at] = place[0] + 1 if len(place) else 0
         runs.named[at] = objects[0] == self._object
         runs.period_deg[at] = self._period_deg
@@ -406,9 +413,8 @@ class _Trials:
             runs.pose_error_deg[at] = away_deg[seen[-1]]
             runs.alike_error_deg[at] = away_deg[self._neighbourhood[seen[-1]]].min()
 
-    def _record_margin(
-        self, ranking: Ranking, seen: list[int], keep: NDArray[np.bool_], runs: Runs, at: tuple[int, int, int, int]
-    ) -> None:
+    def _record_margin(self, ranking: Ranking, seen: list[int], keep: NDArray[np.bool_], at: tuple[int, ...]) -> None:
+        runs = self.runs
         runs.score[at] = ranking.scores[0] / len(seen)
         # hbr.score_margin, from similarities that are computed once for all trials
         reach = self._reach[:, seen].sum(axis=1)
