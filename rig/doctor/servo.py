@@ -145,7 +145,7 @@ def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
 
 
 def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Finding:
-    # Many readings: how long each takes, how many were repeated, and whether the servo's own clock went on.
+    # Many readings: how long each takes, how many were repeated, and whether the servo's own clock runs.
     clock = context.computer.clock
     before = found.bus_statistics
     ticks = _ticks(found)
