@@ -106,6 +106,17 @@ class MotionTimes:
         """Return the duration of the moves along these table angles, with a view at each but the first."""
         return sum(self.move_s(b - a) + self.view_s for a, b in pairwise(angles_deg))
 
+    def left_s(self, angles_deg: Sequence[float], done: int, *, in_motion: bool = False) -> float:
+        """Return the remaining time of an enrollment at these table angles, of which the first views are ``done``.
+
+        It lasts until the table is back at 0. Views ``in_motion`` are reported after their revolution.
+        """
+        if not done or not angles_deg:
+            return self.enrollment_s(angles_deg[0] if angles_deg else 0.0, angles_deg, in_motion=in_motion)
+        if in_motion:
+            return self.park_s(angles_deg[0] + 360.0)
+        return self.views_s(angles_deg[done - 1 :]) + self.move_s(-angles_deg[-1])
+
     def enrollment_s(self, start_deg: float, angles_deg: Sequence[float], *, in_motion: bool = False) -> float:
         """Return the duration of views at these table angles, from ``start_deg`` and back home.
 

@@ -1,7 +1,6 @@
-"""The table angles of an enrollment, and the time that is left of it."""
+"""The table angles of an enrollment."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, floor
 from typing import Final
@@ -9,8 +8,6 @@ from typing import Final
 from hbr.core.angles import wrap360
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
-from rig.events.events import Accepted, Event
-from rig.motion.move import MotionTimes
 
 _FLOAT_DEG: Final = 1e-6  # a limit that a float misses by rounding still counts as reached
 
@@ -62,31 +59,3 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
         )
     nearest = min(revolutions, key=lambda whole: (abs(angles[0] + 360.0 * whole), whole))
     return tuple(angle + 360.0 * nearest for angle in angles)
-
-
-@dataclass(eq=False)
-class TimeLeft:
-    """Remaining time of an enrollment by the motion model.
-
-    ``model`` gives the durations of moves and views, ``angles_deg`` are the table angles of the coming views. Views
-    ``in_motion`` are taken in one revolution, and reported after it.
-    """
-
-    model: MotionTimes
-    angles_deg: Sequence[float]
-    in_motion: bool = False
-    done: int = 0
-
-    def add(self, event: Event) -> None:
-        """Take the next event of the plan."""
-        self.done += isinstance(event, Accepted)
-
-    @property
-    def seconds(self) -> float:
-        """Remaining time in the bench's clock, until the table is back at 0."""
-        model, angles_deg = self.model, self.angles_deg
-        if not self.done or not angles_deg:
-            return model.enrollment_s(angles_deg[0] if angles_deg else 0.0, angles_deg, in_motion=self.in_motion)
-        if self.in_motion:
-            return model.park_s(angles_deg[0] + 360.0)
-        return model.views_s(angles_deg[self.done - 1 :]) + model.move_s(-angles_deg[-1])

@@ -1,4 +1,4 @@
-"""Pictures of a report: a view in its box, and all views of an object in one picture, each with its azimuth."""
+"""Pictures of a report."""
 
 from base64 import b64encode
 from collections.abc import Sequence
@@ -8,15 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.charts import svg
-from rig.core.phrases import azimuth_words
-
 Image = NDArray[np.uint8]
 Region = tuple[int, int, int, int]
 
 _JPEG_QUALITY: Final = 84  # lower: blocks hide grain and edges; higher: a report of many views becomes a large file
-_COLUMNS: Final = 12  # more: the views are too small to compare by eye
-_CAPTION_PX: Final = 17
 _PAPER: Final = 24
 _OUTLINE: Final = (60, 170, 230)
 
@@ -54,21 +49,3 @@ def data_uri(image_bgr: Image) -> str:
     encoded, jpeg = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     assert encoded  # uint8 (H, W, 3) with pixels: `thumbnail` has made it
     return f"data:image/jpeg;base64,{b64encode(jpeg.tobytes()).decode('ascii')}"
-
-
-def contact_sheet(tiles_bgr: Sequence[Image], azimuth_deg: Sequence[float], label: str) -> str:
-    """Lay out views row by row, each with its azimuth below, as SVG with one JPEG: it is smaller than n of them.
-
-    ``tiles_bgr`` are at least one image, uint8 (H, W, 3), all of one size; ``label`` is the alternative text.
-    """
-    height, width = tiles_bgr[0].shape[:2]
-    columns = min(_COLUMNS, len(tiles_bgr))
-    rows, down = -(-len(tiles_bgr) // columns), height + _CAPTION_PX
-    sheet = np.full((rows * down, columns * width, 3), _PAPER, dtype=np.uint8)
-    captions = []
-    for k, (tile, azimuth) in enumerate(zip(tiles_bgr, azimuth_deg, strict=True)):
-        x, y = (k % columns) * width, (k // columns) * down
-        sheet[y : y + height, x : x + width] = tile
-        captions.append(svg.text(f"{azimuth_words(azimuth)}°", (x + width / 2, y + down - 4), "caption"))
-    image = svg.element("image", href=data_uri(sheet), width=columns * width, height=rows * down)
-    return svg.drawing(columns * width, rows * down, label, [image, *captions])

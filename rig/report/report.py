@@ -44,7 +44,7 @@ from rig.events.wording import (
     share_words,
     verification_words,
 )
-from rig.report.pictures import contact_sheet, data_uri, thumbnail
+from rig.report.pictures import data_uri, thumbnail
 from rig.report.records import Correctness, Record
 from rig.search.saved_run import SavedRun
 from rig.views.capture import rejection_text
@@ -276,17 +276,18 @@ def _rejections(record: Record, view: Accepted | None = None) -> str:
 
 def _object(number: int, record: Record, *, unfold: bool) -> Shown:
     views, retakes, started = record.views, record.retakes, record.last(Started)
-    name = started.name if started and started.name else ""
     line = counted(len(views), "view")
     if retakes:
         line += f", {counted(retakes, 'retake')}"
-    shown = Shown(number=number, name=name, line=line, unfold=unfold, items=enrollment_items(record), sheet="")
-    if views:
-        pictures, azimuth_deg = [view.image_bgr for view in views], [view.azimuth_deg for view in views]
-        label = f"Contact sheet of {name}: {line}, each with its azimuth in degrees"
-        shown["sheet"] = Markup(contact_sheet(pictures, azimuth_deg, label))
-        shown["stamp"] = data_uri(thumbnail(pictures[0], _STAMP))
-    return shown
+    return Shown(
+        number=number,
+        name=started.name if started and started.name else "",
+        line=line,
+        unfold=unfold,
+        items=enrollment_items(record),
+        stamp=data_uri(thumbnail(views[0].image_bgr, _STAMP)) if views else "",
+        tiles=[(data_uri(view.image_bgr), f"{azimuth_words(view.azimuth_deg)}°") for view in views],
+    )
 
 
 def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -31,7 +32,6 @@ from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
 from rig.motion.move import MotionTimes
-from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
 from rig.views.description import within
@@ -73,7 +73,7 @@ class ServedDesk(Desk):
         self.job = job
         self.setup = worker.setup
         self._worker = worker
-        self._left: TimeLeft | None = None
+        self._left: Callable[[int], float] | None = None
 
     # -- what a job needs ---------------------------------------------------------------------------------------------
 
@@ -156,17 +156,16 @@ class ServedDesk(Desk):
         if isinstance(event, Started):
             bench = self._worker.bench()
             job.progress = requests.StepsDone(done=0, total=event.views)
-            left = TimeLeft(MotionTimes(bench.config), event.angles_deg, in_motion=event.in_motion)
+            left = partial(MotionTimes(bench.config).left_s, event.angles_deg, in_motion=event.in_motion)
             self._left = left if event.angles_deg else None
-        if self._left is not None:
-            self._left.add(event)
         if isinstance(event, Accepted):
             self._worker.views[job.id].append(jpeg(self._described(event.image_bgr), VIEW_PX))
             values["picture"] = job.views
             job.views += 1
             if job.progress is not None:
-                left_s = None if self._left is None else self._left.seconds
-                job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
+                done = job.progress.done + 1
+                left_s = None if self._left is None else self._left(done)
+                job.progress = job.progress.model_copy(update={"done": done, "seconds_left": left_s})
         # Tell: the event itself, and the job where it has changed. The first view is stored, because from then on the
         # job can be continued after a kill.
         if isinstance(event, Enrolled | Identified):

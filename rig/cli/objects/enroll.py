@@ -1,6 +1,7 @@
 """`rig enroll`."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,6 @@ from rig.jobs.enroll import enroll as enroll_job
 from rig.jobs.enroll import enroll_list
 from rig.jobs.enroll import retake as retake_job
 from rig.motion.move import MotionTimes
-from rig.plans.estimate import TimeLeft
 from rig.plans.tray import read_tray
 
 
@@ -84,7 +84,7 @@ def enroll(
     def show(event: Event) -> None:
         nonlocal stored_views, enrolled
         if isinstance(event, Started):
-            view.left = TimeLeft(MotionTimes(desk.bench.config), event.angles_deg, in_motion=event.in_motion)
+            view.left = partial(MotionTimes(desk.bench.config).left_s, event.angles_deg, in_motion=event.in_motion)
         stored_views += isinstance(event, Accepted)
         enrolled += isinstance(event, Enrolled)
         view.add(event)

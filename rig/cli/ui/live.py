@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, Self
 
@@ -28,7 +29,6 @@ from rig.events.events import (
     event_dict,
 )
 from rig.events.wording import line, ranking_words
-from rig.plans.estimate import TimeLeft
 
 KEYS = "Ctrl+Z: pause, Ctrl+C: stop"
 
@@ -38,10 +38,11 @@ class LiveView(AbstractContextManager["LiveView"]):
 
     Ctrl+Z (SIGTSTP) stops the program after the next view, when the table holds its angle; `fg` (SIGCONT) resumes it.
 
-    ``plain`` prints as into a pipe. ``left`` estimates the time that is left of an enrollment.
+    ``plain`` prints as into a pipe. ``left`` returns the time that is left of an enrollment
+    after a number of views.
     """
 
-    left: TimeLeft | None = None
+    left: Callable[[int], float] | None = None
 
     def __init__(self, settings: Settings, *, plain: bool = False) -> None:
         self._settings = settings
@@ -67,8 +68,6 @@ class LiveView(AbstractContextManager["LiveView"]):
 
     def add(self, event: Event) -> None:
         """Show the next event; if the operator has pressed Ctrl+Z, return when the program is resumed."""
-        if self.left is not None:
-            self.left.add(event)
         if self._settings.json:
             self._settings.print_json(event_dict(event))
         # in a pipe, the text on stderr would only repeat the JSON
@@ -140,7 +139,7 @@ class LiveView(AbstractContextManager["LiveView"]):
             self._live.start(refresh=True)
 
     def _time(self, words: str) -> str:
-        return "" if self.left is None else words.format(duration_words(self.left.seconds))
+        return "" if self.left is None else words.format(duration_words(self.left(self._taken)))
 
     def _print(self, text: str) -> None:
         self._screen.print(text, markup=False, highlight=False, soft_wrap=not self._screen.is_terminal)

@@ -15,7 +15,7 @@ from rig.events.events import Accepted, Enrolled, Started
 from rig.motion.move import MotionTimes
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
-from rig.plans.estimate import TimeLeft, even_azimuths, table_angles
+from rig.plans.estimate import even_azimuths, table_angles
 from tests.rig.bench_parts import motion_bench
 
 LIMITS = st.floats(-2000, 0).flatmap(
@@ -55,15 +55,13 @@ def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_pat
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         model = MotionTimes(s.bench.config)
         angles_deg = table_angles(even_azimuths(views, (-400, 400)), (-400, 400))
-        left = TimeLeft(model, angles_deg)
-        predicted = []
+        predicted: list[tuple[int, float]] = []
         for event in enroll(s.bench, catalog, "dice", views=views):
-            left.add(event)
             if isinstance(event, Started):
                 assert event.angles_deg == angles_deg
                 start_ns = s.bench.clock.now_ns()
             if isinstance(event, Accepted):
-                predicted.append((s.bench.clock.now_ns(), left.seconds))
+                predicted.append((s.bench.clock.now_ns(), model.left_s(angles_deg, len(predicted) + 1)))
     end_ns = s.bench.clock.now_ns()
     duration_s = (end_ns - start_ns) * 1e-9
     assert isinstance(event, Enrolled)

@@ -2,9 +2,10 @@
 
 import io
 import signal
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from itertools import islice
 
 import pytest
@@ -19,7 +20,6 @@ from rig.config import load_config
 from rig.core.errors import UsageError, ViewRejected
 from rig.events.events import Event, FrameUsed, Item, SimilarObjects
 from rig.motion.move import MotionTimes
-from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Question
 from rig.plans.tray import TrayItem, after_error, next_object
 from tests.programs import Program
@@ -43,7 +43,7 @@ def shown(request, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     output = request.param()
 
-    def show(events: Iterable[Event], left: TimeLeft | None = None) -> str:
+    def show(events: Iterable[Event], left: Callable[[int], float] | None = None) -> str:
         monkeypatch.setattr("sys.stdout", output)
         with LiveView(Settings()) as view:
             view.left = left
@@ -60,8 +60,8 @@ def is_terminal(text: str) -> bool:
 
 def test_enrollment_has_a_line_for_each_step_and_ends_with_similar_objects(shown):
     *events, last = enrolling(views=8, retaken=(3,))
-    left = TimeLeft(MotionTimes(load_config()), events[0].angles_deg)
-    text = shown([Item(3, 25, "mug-white", "enroll"), *events, SIMILAR, last], left)
+    left = MotionTimes(load_config()).left_s
+    text = shown([Item(3, 25, "mug-white", "enroll"), *events, SIMILAR, last], partial(left, events[0].angles_deg))
     assert text.startswith("3 of 25 mug-white: 8 views, about ")
     assert "view 4, attempt 1: rejected, blurred (sharpness 2.0 < 3)" in text
     assert text.count(", azimuth ") == 8
