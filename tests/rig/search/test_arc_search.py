@@ -35,7 +35,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Model]:
         Catalog.open(tmp_path_factory.mktemp("model"), clock=bench.clock) as catalog,
     ):
         for name in NAMES:
-            list(enroll(bench, catalog, name, views=18))
+            list(enroll(bench, catalog, name, views=9))
         yield load_model(catalog)
 
 
