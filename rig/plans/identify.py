@@ -55,7 +55,7 @@ from rig.motion.scan_speed import can_fly, require_camera_time, scan_speed
 from rig.motion.turntable import Turntable
 from rig.plans.steps import ObjectCheck, accepted, announced, capture, check_camera, moved, warn_of_table
 from rig.search.model import Model, begin_search, empty_table_for
-from rig.search.session import SHOWN, AnyStrategy, Finish, Rotate, Search
+from rig.search.session import AnyStrategy, Finish, Rotate, Search
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
 from rig.views.empty_table import empty_table_status
@@ -305,7 +305,6 @@ def identify(
     placer: Placer | None = None,
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
-    top: int = SHOWN,
     live: Callable[[FrameUsed], object] = lambda _: None,
 ) -> Generator[Event, None, Identified]:
     """Identify the object on the table; yields events and returns the answer.
@@ -316,7 +315,7 @@ def identify(
     The model is from `rig.search.model.load_model` or `rig.search.model.model_of`. The default strategy is the one that
     the model is for; ``seed`` is for those that draw random numbers. ``config`` are settings of the search that are not
     those of the bench. ``placer`` puts the object on the table, or waits for it; the default is that of the bench.
-    Events name the ``top`` candidates. ``live`` is called with the event of each frame of a search in motion while the
+    ``live`` is called with the event of each frame of a search in motion while the
     table rotates; the plan yields these events when it has stopped. It must return at once.
 
     Raises `CatalogError`: nothing is enrolled. `CameraSettingsDiffer`: all objects were enrolled with other settings of
@@ -327,7 +326,7 @@ def identify(
     config = config or bench.config
     if strategy is None and _flies(config, model):
         strategy = "arc"
-    search = begin_search(model, config, strategy, seed=seed, top=top)
+    search = begin_search(model, config, strategy, seed=seed)
     if search.in_motion:
         require_camera_time(bench.config)
     check_camera(bench, model.camera)

@@ -25,7 +25,7 @@ from rig.config import RigConfig
 from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
-from rig.search.session import SHOWN, AnyStrategy, DenseSearch, EnrolledViews, HoughSearch, PoseSearch, Search
+from rig.search.session import AnyStrategy, DenseSearch, EnrolledViews, HoughSearch, PoseSearch, Search
 from rig.search.strategies import descriptor_for, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR, DENSE_DESCRIPTORS
@@ -82,11 +82,11 @@ _poses = lru_cache(maxsize=4)(PoseModel)  # built once for each model
 
 
 def begin_search(
-    model: Model, config: RigConfig, strategy: AnyStrategy | str | None = None, *, seed: int = 0, top: int = SHOWN
+    model: Model, config: RigConfig, strategy: AnyStrategy | str | None = None, *, seed: int = 0
 ) -> Search:
     """Begin a search by a strategy: its name or an object, by default the one that the model is for.
 
-    ``seed`` is for strategies that draw random numbers; events name the ``top`` candidates.
+    ``seed`` is for strategies that draw random numbers.
 
     Raises `CatalogError`: nothing is enrolled. `UsageError`: there is no such strategy, or the model is not for it.
     """
@@ -102,7 +102,7 @@ def begin_search(
             next_step=f"Load it with rig.search.model.load_model(catalog, descriptor={wanted!r}), or use another "
             "strategy.",
         )
-    common = model.views, config, chosen, seed, top
+    common = model.views, config, chosen, seed
     if isinstance(model.index, hbr.ViewIndex):
         if getattr(chosen, "poses", False):
             return PoseSearch(*common, _poses(model.views))

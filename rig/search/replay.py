@@ -59,9 +59,7 @@ def check(run: SavedRun) -> ReplayCheck:
     """
     started = run.started
     found = ReplayCheck(is_complete=run.error is not None and not run.is_cut)
-    search = begin_search(
-        run.model, run.config, started.strategy, seed=started.seed or 0, top=len(run.views.object_names)
-    )
+    search = begin_search(run.model, run.config, started.strategy, seed=started.seed or 0)
     # A search in motion has too many frames to segment the earlier ones again.
     revise = not search.in_motion
     describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
@@ -85,9 +83,7 @@ def check(run: SavedRun) -> ReplayCheck:
             case ObjectChanged():
                 computed = search.changed() or {}
             case Ranked():
-                # The number of candidates is a setting of the run.
-                ranked, _ = search.decide()
-                computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
+                computed, _ = search.decide()
             case FrameUsed() if search.in_motion:
                 computed = search.frame_used(event.index, event.azimuth_deg, event.seconds, event.rejected)
             case Decided():
@@ -100,8 +96,7 @@ def check(run: SavedRun) -> ReplayCheck:
                 computed = answered(search.verify((), measured))
             case Identified():
                 found.decisions += 1
-                answer = search.answer(travelled_deg=event.travelled_deg, seconds=event.seconds)
-                computed = replace(answer, candidates=answer.candidates[: len(event.candidates)])
+                computed = search.answer(travelled_deg=event.travelled_deg, seconds=event.seconds)
                 found.is_complete = not run.is_cut
             case _:
                 pass
@@ -118,8 +113,7 @@ def _decided(search: Search, saved: Decided) -> Decided | dict[str, Any]:
     _, step = search.decide()
     if isinstance(step, Finish):
         return {"reason": plain(step.reason)}
-    computed = search.decided(saved.index, saved.target_deg)
-    return replace(computed, candidates=computed.candidates[: len(saved.candidates)])
+    return search.decided(saved.index, saved.target_deg)
 
 
 def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[ReplayDifference]:

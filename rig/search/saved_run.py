@@ -38,8 +38,6 @@ FORMAT: Final = "hbr-rig run"
 VERSION: Final = 1  # a run of another version is not checked, because its decisions come from another program
 EMPTY_TABLE: Final = "empty_table.png"
 
-MAX_FRAME_PIXELS: Final = 64_000_000
-"""8000 x 8000, the largest frame of the configuration."""
 MAX_REASON: Final = 300  # a reason can contain the whole damaged value
 _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.jsonl": 10_000_000}
 """Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
@@ -279,7 +277,7 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
 
 
 def _image(folder: Path, name: str) -> NDArray[np.uint8]:
-    image = images.decode(_bytes(folder, name), max_pixels=MAX_FRAME_PIXELS)
+    image = images.decode(_bytes(folder, name))
     if min(image.shape[:2]) < MIN_SIDE_PX:
         raise ValueError(f"{name} has {image.shape[1]} x {image.shape[0]} pixels")
     return image

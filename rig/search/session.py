@@ -49,7 +49,7 @@ EnrolledViews = Callable[[str, Sequence[float]], Sequence[LocalView]]
 
 
 SHOWN: Final = 5
-"""Candidates that an event names by default."""
+"""Candidates that an event names."""
 
 Hypotheses = Sequence[Sequence[hbr.Segmentation]]
 """All segmentations of each view of a search, the likeliest first (`rig.views.description.SearchDescriber`)."""
@@ -119,8 +119,6 @@ class Search(ABC):
     config: RigConfig
     strategy: AnyStrategy
     seed: int
-    top: int
-    """How many candidates an event names."""
     in_motion: bool = field(default=False, init=False)
     """Whether the frames of a rotation are its views."""
     ranked: Ranked = field(init=False)
@@ -208,7 +206,7 @@ class Search(ABC):
             target_deg=target_deg,
             s_left=step.s_left,
             s_right=step.s_right,
-            candidates=step.candidates[: self.top],
+            candidates=step.candidates[:SHOWN],
             reason=RotationReason(step.reason),
             note=step.note,
             weighed=step.weighed,
@@ -316,7 +314,7 @@ class HoughSearch(PaperSearch):
         views = len(queries)
         candidates = tuple(
             Candidate(name, float(score) / views, float(pose_deg))
-            for name, score, pose_deg in zip(ranking.names[: self.top], ranking.scores, ranking.pose_deg, strict=False)
+            for name, score, pose_deg in zip(ranking.names[:SHOWN], ranking.scores, ranking.pose_deg, strict=False)
         )
         return Ranked(views - 1, candidates, hbr.score_margin(ranking, queries) / views)
 
@@ -368,7 +366,7 @@ class PoseSearch(PaperSearch):
         numbers = zip(*(each.tolist() for each in (self._objects, score, poses_deg, self._probability)), strict=True)
         candidates = tuple(Candidate(self.names[j], *rest) for j, *rest in numbers)
         margin = float(score[0] - score[1:].max(initial=0.0))
-        return Ranked(views - 1, candidates[: self.top], margin)
+        return Ranked(views - 1, candidates[:SHOWN], margin)
 
     def _answer(self) -> Identified:
         count = 1 + int((np.cumsum(self._probability) < CONFIDENT).sum())
@@ -424,7 +422,7 @@ class DenseSearch(Search):
         """Return the leading candidates, the likeliest first, with their shares of the posterior."""
         belief, probability = self.session.belief, self._probability()
         found = []
-        for place in self._order[: self.top].tolist():
+        for place in self._order[:SHOWN].tolist():
             one = int(belief.index.object_index[place])
             numbers = float(self._scores[place]), azimuth_of(belief, one), float(probability[place])
             found.append(Candidate(self.names[one], *numbers))

@@ -69,7 +69,7 @@ class BadImage(ValueError):
     """Bytes that are not a valid image; the message says why."""
 
 
-def decode(content: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]:
+def decode(content: bytes) -> NDArray[np.uint8]:
     """Return the pixels of any PNG or JPEG file, uint8 (H, W, 3) BGR.
 
     The size in the file's header is checked before memory is allocated.
@@ -85,8 +85,8 @@ def decode(content: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]
     if found is None or end not in content[-4096:]:  # padding after the end is legal
         raise BadImage("truncated or damaged")
     width, height, _ = found
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= max_pixels):
-        raise BadImage(f"{width} x {height} pixels; at most {max_pixels} pixels and sides of {MAX_SIDE} are possible")
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise BadImage(f"{width} x {height} pixels; at most {MAX_PIXELS} pixels and sides of {MAX_SIDE} are possible")
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:

@@ -46,8 +46,8 @@ def saved_runs(home: Path, strategies: Sequence[str] = ("ahbr", "hbr", "sweep", 
         index = model_of(derived.views(catalog))
         for number, strategy in enumerate(strategies):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number
-            events = searched(home / strategy, bench, index, strategy=strategy, seed=number, top=2)
+            events = searched(home / strategy, bench, index, strategy=strategy, seed=number)
             runs[strategy] = home / strategy, events
         operator.next_object, operator.yaw_deg = "mug-star", 70.0
-        runs["dense"] = home / "dense", searched(home / "dense", bench, load_model(catalog), top=2)
+        runs["dense"] = home / "dense", searched(home / "dense", bench, load_model(catalog))
     return runs

@@ -34,9 +34,9 @@ def model(objects: int = 4, views: int = 12) -> hbr.Views:
     )
 
 
-def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, top: int = 5, **config: float) -> Search:
+def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, **config: float) -> Search:
     settings = RigConfig(identify=IdentifyConfig(**config))  # type: ignore[arg-type]
-    return begin_search(model_of(known), settings, chosen, seed=seed, top=top)
+    return begin_search(model_of(known), settings, chosen, seed=seed)
 
 
 def added(
@@ -102,14 +102,6 @@ def test_score_below_min_score_ends_no_search_early():
     other = np.roll(known.descriptors[0], 1)
     steps = [added(search, other, 0.0, table_deg=0.0)[1] for _ in range(5)]
     assert [isinstance(step, Finish) for step in steps] == [False] * 4 + [True]
-
-
-def test_top_limits_the_named_candidates():
-    known = model(objects=9)
-    for top in (1, 3):
-        search = searching(known, "ahbr", top=top)
-        ranked, _ = added(search, known.descriptors[0], 0.0, table_deg=0.0)
-        assert len(ranked.candidates) == top
 
 
 def test_empty_catalog_and_an_unknown_strategy_are_rejected():
