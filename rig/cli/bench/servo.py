@@ -11,7 +11,7 @@ from rig.cli.ui.command import Group
 from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption
-from rig.cli.ui.present import show_progress
+from rig.cli.ui.present import first, show_progress
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.config.values import default_path
@@ -135,11 +135,10 @@ def replay_(
         lines.append(f"Replies of the servo: after {was:.1f} ms, of the simulated one after {now:.1f} ms.")
     found = [f"{name}: {one}" for name, result in results.items() for one in result["differences"]]
     if found:
-        more = [f"and {len(found) - SHOWN} more: --json"] * (len(found) > SHOWN)
         raise ReplayMismatch(
             " ".join([f"The trace {file} differs in {counted(len(found), 'field')}.", *lines]),
             next_step="If a real device sent it, correct its driver or its simulation, or send the trace to us.",
-            evidence=values if settings.json else {"differences": found[:SHOWN] + more},
+            evidence=values if settings.json else {"differences": first(found, SHOWN)},
         )
     counts = [f"{counted(result['compared'], 'value')} against the {name}" for name, result in results.items()]
     settings.say("\n".join([f"No difference: {', '.join(counts)}.", *lines]), values)

@@ -19,7 +19,7 @@ from rig.catalog.exchange.training import Annotations, write_training
 from rig.catalog.transfer import CatalogSource, Conflict, TransferSource, transfer
 from rig.cli.ui.command import command
 from rig.cli.ui.options import JobsOption
-from rig.cli.ui.present import run_job, size_words
+from rig.cli.ui.present import first, run_job, size_words
 from rig.cli.ui.settings import Settings
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.clock import SystemClock, seconds_between
@@ -103,10 +103,8 @@ def import_(
         lines += [f"{title}: {', '.join(names[:SHOWN])}"] if names else []
     settings.say("\n".join(lines), {"dry_run": dry_run, "seconds": round(seconds, 3), **plain(done)})
     if done.rejected:
-        shown = [f"  {file.path}: {file.reason}" for file in done.rejected[:SHOWN]]
-        more = len(done.rejected) - SHOWN
-        shown += [f"  and {more} others (--json lists all)"] if more > 0 else []
-        print(f"{counted(len(done.rejected), 'file')} rejected:", *shown, sep="\n", file=sys.stderr)
+        shown = first([f"{file.path}: {file.reason}" for file in done.rejected], SHOWN)
+        print(f"{counted(len(done.rejected), 'file')} rejected:", *shown, sep="\n  ", file=sys.stderr)
 
 
 @contextmanager

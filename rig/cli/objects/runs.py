@@ -7,6 +7,7 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.live import LiveView
+from rig.cli.ui.present import first
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ReplayMismatch, RunIncomplete, UsageError
 from rig.core.json_form import plain
@@ -98,8 +99,7 @@ def _check(settings: Settings, saved: SavedRun) -> None:
     if found.differences:
         listed = [str(one) for one in found.differences]
         if not settings.json:
-            more = len(listed) - SHOWN
-            listed = [short(one, 120) for one in listed[:SHOWN]] + [f"and {more} more: --json"] * (more > 0)
+            listed = first([short(one, 120) for one in listed], SHOWN)
         raise ReplayMismatch(
             f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {done}",
             next_step="Check whether the files of the run were changed. If not, this version of the program decides "

@@ -74,6 +74,12 @@ def _cell(value: Any) -> str:
             return str(value)
 
 
+def first(items: Sequence[str], count: int) -> list[str]:
+    """Return the first items of a long list, and how many more ``--json`` prints."""
+    more = len(items) - count
+    return [*items[:count], *([f"and {more} more: --json"] if more > 0 else [])]
+
+
 class ProgressBar(AbstractContextManager["ProgressBar"]):
     """A progress bar on stderr, shown from its first call on; only its notes if stderr is not a terminal."""
 
