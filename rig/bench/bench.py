@@ -255,6 +255,7 @@ def open_bench(
     config = config or RigConfig()
     kind, options = _kind(name or config.default_bench, config)
     bench = kind.open(config, options, seed)
+    # Calibrations are applied last: which of them are in force depends on the devices that answered.
     try:
         bench.open_devices(devices)
         calibrate(bench, CalibrationStore(config.calibration_path(bench.name)))

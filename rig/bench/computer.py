@@ -119,6 +119,7 @@ class Computer:
 
     def serial_ports(self) -> list[SerialPort]:
         """Return the ports that are connected to hardware; the computer's own come last."""
+        # sysfs lists every terminal; a port of an adapter has a device.
         ports = []
         for entry in self._entries("sys/class/tty"):
             device = entry / "device"
@@ -236,6 +237,7 @@ class Computer:
         path = camera_node(source)
         if path is None:
             return None
+        # By what the camera says of itself, as far as that distinguishes it; else by its place.
         file = self._at(path).resolve()
         usb = self._usb(self.root / _CAMERAS / file.name / "device")
         kind = (
@@ -262,6 +264,7 @@ class Computer:
 
     def joined(self, group: str) -> bool:
         """Return whether the user is a member of the group, in this login or only after the next one."""
+        # In the file a new membership counts at once, for processes only after the next login.
         for line in self._text("/etc/group").splitlines():
             name, _, rest = line.partition(":")
             if name == group:
@@ -393,6 +396,7 @@ class Computer:
         return str(gid)
 
     def _holders(self, path: str) -> Iterator[Process]:
+        # A program may have opened the port by any of its names.
         wanted = str(self._at(path).resolve())
         for process in self._entries("proc"):
             if not process.name.isdigit() or int(process.name) == os.getpid():

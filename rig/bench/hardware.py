@@ -215,6 +215,7 @@ def camera_settings(config: RigConfig, state: StateStore, device: str | None) ->
     settings = config.camera
     if settings.focus is not None:
         return settings
+    # Of this camera only: another lens is sharp at another number.
     try:
         stored = json.loads(state.read_file(_FOCUS_FILE) or b"{}")
         focus = float(stored["focus"]) if stored["device"] == device else None

@@ -62,6 +62,7 @@ def head_sensor(config: ImuConfig) -> HeadSensor:
 
     Raises `ConfigError`: a head does not support the sensor, or the sensor a setting.
     """
+    # It sets its rate and range itself, and takes seconds to start.
     if config.model == "bno055":
         return HeadSensor(
             kind=bno055.Bno055.KIND,
@@ -81,6 +82,7 @@ def head_sensor(config: ImuConfig) -> HeadSensor:
             next_step=f"Set imu.model to {', '.join(mpu6050.DRIVERS)} or bno055, or connect the sensor to the "
             "computer's own I2C bus.",
         )
+    # The settings of the computer's own driver, as the three numbers that the firmware writes.
     lsb_per_c, zero_c = driver.TEMPERATURE
     registers = mpu6050.settings(config.range_dps, config.rate_hz, config.bandwidth_hz)
     divider, dlpf, full_scale, _ = registers[mpu6050.SMPLRT_DIV]
