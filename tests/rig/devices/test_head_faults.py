@@ -11,7 +11,7 @@ from rig.core.errors import (
     RequestRejected,
 )
 from rig.devices.head.head import RigHead
-from rig.devices.head.link import HeadLink
+from rig.devices.head.link import HeadFrame, HeadLink, encode
 from rig.devices.head.protocol import (
     BAUD,
     PROTOCOL_VERSION,
@@ -47,7 +47,7 @@ def test_corrupt_frames_cost_samples_but_give_no_wrong_value(opened):
     start_ns = opened.clock.now_ns()
     opened.head.filters.append(lambda _to_head, byte: byte ^ 0x20 if rng.random() < 0.002 else byte)
     rates, times, lost = [], [], 0
-    for _ in range(25):
+    for _ in range(50):
         opened.clock.sleep(0.1)
         samples = opened.imu.read_samples()
         rates.append(samples.gyro_dps)
@@ -77,6 +77,17 @@ def test_late_reply_answers_no_other_request():
         h.clock.sleep(0.1)
         link.poll()
         assert link.request(Hello(PROTOCOL_VERSION), Identity).protocol == PROTOCOL_VERSION
+
+
+def test_repeated_request_is_carried_out_once(opened):
+    """A head knows a repetition by its number: it does not read the body again."""
+    link = opened.imu._link
+    opened.imu._cancel()
+    link.request(Light(200), Done)
+    link._connection.write(encode(HeadFrame(Light.ID, link._sequence, bytes([5]))))
+    opened.clock.sleep(0.05)
+    opened.head.catch_up()
+    assert opened.head.light == pytest.approx(200 / 255)
 
 
 @AVR_NIGHTLY
