@@ -97,17 +97,9 @@ class Journal(Catalog):
         others = self._ask(lambda shared: [one for one in shared.objects() if one.enrolled_utc is not None])
         return [*own, *(one for one in others or () if one.name not in names)]
 
-    def check_enrollable(
-        self,
-        name: str,
-        *,
-        label: str | None = None,
-        note: str | None = None,
-        resume: bool = False,
-        replace: bool = False,
-    ) -> None:
+    def check_enrollable(self, name: str, *, resume: bool = False, replace: bool = False, **texts: str | None) -> None:
         """Raise what `begin` or `resume` would raise; for a new object also if the server has the name."""
-        super().check_enrollable(name, label=label, note=note, resume=resume, replace=replace)
+        super().check_enrollable(name, resume=resume, replace=replace, **texts)
         if not resume:
             self._ask(lambda shared: shared.check_enrollable(name, replace=replace))
 
