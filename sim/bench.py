@@ -244,8 +244,6 @@ def open_sim_bench(
             operator.faults.listeners.append(on_fault)
         if owned:
             wires.callback(operator.faults.clear)
-        devices.camera.reopen()  # an earlier bench may have closed it
-        devices.reopen_adapter()
         operator.faults.schedule(*faults)
         # Assemble the bench, with a cable that is not wound up in a new world.
         computer = SimComputer(_NO_FILES, devices, config)  # opening a bench looks for no other devices

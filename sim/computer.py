@@ -169,7 +169,9 @@ class SimComputer(Computer):
         return self.devices.camera.node()
 
     def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one camera
-        return self.devices.reopen_camera()
+        if not self.devices.camera.reopen():
+            raise DeviceNotFound("No camera is connected.", next_step="Connect the camera.")
+        return self.devices.camera
 
 
 @contextmanager

@@ -86,15 +86,6 @@ class SimDevices(AbstractContextManager["SimDevices"]):
             raise DeviceNotFound("No rig head is connected to this port.", next_step="Connect its USB cable.")
         return HeadSerial(self.head)
 
-    def reopen_camera(self) -> SimCapture:
-        """Open the camera's stream again, for example after it was unplugged.
-
-        Raises `DeviceNotFound` if the camera is unplugged.
-        """
-        if not self.camera.reopen():
-            raise DeviceNotFound("No camera is connected.", next_step="Connect the camera.")
-        return self.camera
-
     def reopen_adapter(self) -> SimSerial:
         """Open the servo's port, even after its adapter was unplugged.
 

@@ -67,9 +67,7 @@ class SimMpu6050(SimulatedImu):
 
     @property
     def rate_hz(self) -> float:
-        registers = self._registers
-        internal_hz = 8000 if registers[CONFIG] & 0x07 in (0, 7) else 1000
-        return internal_hz / (1 + registers[SMPLRT_DIV]) * (1 + self.clock_error)
+        return self._internal_clock()[0] / (1 + self._registers[SMPLRT_DIV]) * (1 + self.clock_error)
 
     def power_cycle(self) -> None:
         super().power_cycle()
