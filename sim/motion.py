@@ -133,6 +133,7 @@ class Response:
 
     def follow(self, path: PiecewiseMotion, angle_deg: float, speed_dps: float) -> PiecewiseMotion:
         """Return the motion of a shaft with this angle and speed at the beginning of ``path``."""
+        # The law is solved in steps that are short beside the lag, each a piece of constant acceleration.
         step_s = max(self.lag_s / 5, 0.004)
         lag_s = max(self.lag_s, step_s / 2)  # below it the steps would oscillate
         rows: list[tuple[float, float, float, float]] = []
@@ -146,6 +147,7 @@ class Response:
                 since = t + h - begun
                 error = p + p_dps * since + 0.5 * p_dps2 * since * since + self.offset_deg - x - v * h / 2
                 sign = copysign(1.0, v or error)
+                # Friction holds a shaft at rest, and takes its part of the error from a moving one.
                 if not v and abs(error) <= self.half_deg:
                     w = 0.0
                 else:
@@ -153,6 +155,7 @@ class Response:
                     w = 0.0 if w * sign < 0 and self.half_deg else w
                 # Below the least of these, rounding keeps a shaft from ever being close enough.
                 close_dps = min(_STEADY_DPS, max(abs(p_dps) / 10, 1e-9)) if p_dps else _STEADY_DPS
+                # A shaft that follows steadily does so until the path's next piece: one step for all that time.
                 steady = not p_dps2 and max(abs(w - p_dps), abs(v - p_dps)) < close_dps
                 if steady and (p_dps or abs(error) - self.half_deg < _STEADY_DPS * lag_s + abs(v) * h):
                     h, v, w = end_s - t, p_dps, p_dps

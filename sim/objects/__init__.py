@@ -1,1 +1,1 @@
-"""Objects for the simulated platter: built-in ones, and photographs of real ones."""
+"""Objects for the simulated platter, as data, and what draws them."""

@@ -46,25 +46,8 @@ class Arduino:
     """A board with a boot loader, as a connection of `sim.realtime.port.PtyPort`.
 
     A pseudo-terminal does not show DTR, which resets a real board when a program opens its port. Here the board is
-    reset when a program has set a baud rate, which it does when it opens the port.
-
-    Parameters
-    ----------
-    world
-        The simulated world.
-    kind
-        The boot loader.
-    baud
-        Returns the baud rate that a program has set; 0 if none has.
-
-    Attributes
-    ----------
-    flash, eeprom
-        Content of the memories. An erased byte is 0xFF.
-    program
-        The running program; None while the boot loader runs.
-    resets
-        How often the board was reset.
+    reset when a program has set a baud rate, which it does when it opens the port. ``baud`` returns that rate; 0 if no
+    program has set one. ``program`` is the running program; None while the boot loader runs.
     """
 
     def __init__(self, world: World, kind: Kind, baud: Callable[[], int]) -> None:
