@@ -13,6 +13,7 @@ from collections.abc import Callable
 from ctypes import CFUNCTYPE, POINTER, Structure, c_bool, c_int32, c_uint8, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -51,23 +52,16 @@ class PinChange:
     value: float
 
 
-class _BoardClock:
-    def __init__(self, head: "SimHead") -> None:
-        self._head = head
-
-    def now_ns(self) -> int:
-        return self._head.now_ns
-
-
 class _WorldAtBoardTime:
     """The world at the board's time; all other attributes are the world's."""
 
     def __init__(self, head: "SimHead", world: World) -> None:
-        self.clock = _BoardClock(head)
+        self.clock = SimpleNamespace(now_ns=lambda: head.now_ns)
+        self._head = head
         self._world = world
 
     def table_deg(self, time_ns: int | None = None) -> float:
-        return self._world.table_deg(self.clock.now_ns() if time_ns is None else time_ns)
+        return self._world.table_deg(self._head.now_ns if time_ns is None else time_ns)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._world, name)
