@@ -91,8 +91,6 @@ def test_enrollment_takes_each_photograph_with_its_own_angle(rig: Rig) -> None:
         assert image.shape == (SIZE, SIZE, 3)
         assert apart(azimuth_deg, nearest_angle("obj1", image, 45)) < 1
         np.testing.assert_allclose(image, drawn("obj1", round(azimuth_deg / 45) * 45 % 360), atol=1)
-    assert rig("enroll", "obj2", "--views", "4", "--yes").exit_code == 0
-    assert len(stored_views("obj2")) == 4
 
 
 @pytest.mark.nightly
