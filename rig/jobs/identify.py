@@ -83,6 +83,7 @@ def identify(
             if uses_image and placer is not None:
                 yield from refresh_table_image(desk, bench, placer, ask=False)
 
+            # The plan: one search, or one after the other.
             def one() -> Generator[Event, None, Identified]:
                 enrolled = model() if watch else known  # objects enrolled meanwhile are found
                 return identify_one(
@@ -98,6 +99,8 @@ def identify(
                 with_image=config.record == "image",
             )
             recorder.sample = sample
+            # Each event is saved before it is shown. An answer is recorded after it was shown, so that a catalog that
+            # fails does not hide it.
             with closing(events), saving(next_folder, bench, model, settings) as save:
                 for event in events:
                     if scan and watch and isinstance(event, Started):  # the object is on the table

@@ -92,6 +92,7 @@ def _report_without_servo(context: DoctorContext, missing: RigError) -> dict[str
 
 def _report_of_server(server: ServerAddress) -> dict[str, Any]:
     place = urlsplit(server.url)
+    # An address that stands for all of this computer's cannot be called.
     everywhere = place.hostname in ("0.0.0.0", "::")
     url = f"{place.scheme}://{f'127.0.0.1:{place.port}' if everywhere else place.netloc}/api/v1/status"
     context = ssl.create_default_context(cafile=server.certificate) if server.certificate else None

@@ -70,10 +70,12 @@ def home(desk: Desk, *, revolutions: int | None = None) -> Steps[bool]:
     """
     with desk.open_bench(DEVICES) as bench:
         safety, seen_deg, subject = bench.safety, None, Subject.LONG_WAY
+        # The angle: by the home mark if it is in doubt, otherwise by the encoder.
         if safety.doubt and bench.config.mark.card[0]:
             seen_deg = _seen_deg(bench, safety.doubt, required=revolutions is None)
             if seen_deg is not None and revolutions is None:
                 subject, revolutions = Subject.REVOLUTION, round((_last_deg(bench, safety.doubt) - seen_deg) / 360.0)
+        # The revolution: only the operator sees the cable.
         if revolutions is not None:
             if seen_deg is not None:
                 angle_deg = seen_deg + 360.0 * revolutions

@@ -42,6 +42,7 @@ def show(
     """
     values = read_values(settings.config, settings.overrides)
     config, options = check_config(values)
+    # A calibration sets only what the file and --set leave at its default, as when the bench is opened.
     in_force = _calibrations_in_force(settings, config)
     applied, _ = apply_results(config, in_force)
 
@@ -69,6 +70,7 @@ def show(
         }
         settings.print_json({"path": values.path, "keys": keys})
         return
+    # As TOML, so that it can become a file.
     none = f"no file: the defaults. Looked for: {', '.join(map(str, search_paths()))}"
     print(f"# {values.path or none}")
     section = None

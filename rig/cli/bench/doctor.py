@@ -53,7 +53,7 @@ def doctor(
 
     Example: rig doctor --bench sim
     """
-    if udev:
+    if udev:  # alone, because the output is written into a file of the system
         with settings.open_parts() as context:
             print(udev_rules(context.computer.serial_ports()), end="")
         return
@@ -62,6 +62,7 @@ def doctor(
     elif trace:
         raise UsageError("--trace needs a bundle.", next_step="Add --bundle FILE.zip.")
     found = print_findings(settings)
+    # The bundle comes last: a problem that was found must not prevent it.
     if bundle is not None:
         packed = support_bundle(
             found.findings,

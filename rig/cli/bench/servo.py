@@ -105,6 +105,7 @@ def record(
     """
     if not still:
         confirm(f"The table rotates by up to {REACH_DEG:.0f}° and back.", yes=yes, settings=settings)
+    # The adapter delays replies, so the trace says which one it is.
     with settings.open_parts() as context:
         port = context.computer.serial_port(context.config.servo.port)
     adapter: dict[str, Any] = {key: port.usb.get(key) for key in ("idVendor", "idProduct")} if port else {}
@@ -127,6 +128,7 @@ def replay_(
     config = trace.config.model_copy(update={"bench": settings.load().bench, "imu": sensor})
     with open_context("sim", config, seed=settings.seed) as context:
         simulated = replay_devices(trace, context.computer)
+    # Once with the drivers on the recorded bytes, and once with the recorded requests on the simulated devices.
     results = {"driver": replay_drivers(trace).as_dict(), "simulator": simulated.as_dict()}
     values = {"bench": trace.header.bench, "software": trace.header.software, "is_cut": trace.is_cut, **results}
     lines = ["Its last line is cut off: the recording was interrupted."] * trace.is_cut

@@ -50,6 +50,7 @@ def _report_lines(report: Mapping[str, Any]) -> Iterator[str]:
     if page:
         yield f"job      {report.get('job') or 'none'}"
         return
+    # The devices: of one that fails, the error takes the place of its values.
     for device in ("servo", "imu", "head", "camera"):
         if values := report.get(device):
             error = values.get("error")

@@ -93,6 +93,7 @@ def import_(
         what = "checking" if dry_run else "importing"
         done = run_job(what, job, interrupted="Interrupted; nothing was imported.")
     seconds = seconds_between(begin_ns, clock.now_ns())
+    # What was imported, on stdout; the files that were not are a warning.
     lines = [
         f"{'Would import' if dry_run else 'Imported'} {counted(done.objects, 'object')} with "
         f"{counted(done.views, 'view')}, {size_words(done.bytes)}, in {seconds:.1f} s."

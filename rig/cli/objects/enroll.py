@@ -74,6 +74,7 @@ def enroll(
 
     Example: rig enroll mug-white --bench sim --retake 6
     """
+    # What is asked for: one object, some of its views again, or a list.
     again = [number - 1 for number in retake or ()]
     options = {"label": label, "note": note, "resume": resume, "replace": replace, "views": views, "fly": fly}
     _check(name, tray, retake=retake, **options)
@@ -101,7 +102,7 @@ def enroll(
             job = enroll_list(desk, items, **how)
         try:
             desk.run("tray" if name is None else "retake" if again else "enroll", job, show)
-        except BaseException:
+        except BaseException:  # also Ctrl+C: how to continue is the last that the operator reads
             view.hide()
             if stored_views and not again:
                 one = Do.CONTINUE_ENROLLMENT(name=name).with_options(settings.arguments())

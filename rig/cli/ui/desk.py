@@ -114,7 +114,7 @@ class CommandDesk(Desk):
             state, failure, text = "failed", error.problem, error.problem.detail
             raise
         finally:
-            steps.close()
+            steps.close()  # the table stops before the operator hears that the job has ended
             if self.config.notify_command:
                 job = {"kind": kind, "state": state, "error": failure, "result": result}
                 notify_of_job(self.config.notify_command, self._settings.bench_name, kind, text, job)
