@@ -40,7 +40,7 @@ class ImuKind:
 _AT: Final = (0x68, 0x69)  # AD0 low or high
 _MPU: Final = ("range_dps", "rate_hz", "bandwidth_hz")
 _CLONE: Final = (
-    "a clone of the MPU-6050 without a datasheet: a wrong scale shows in the first motions, and "
+    "a clone of the MPU-6050 without a datasheet: it passed a test of its samples and of gravity; "
     "its temperature may be wrong by 16 °C"
 )
 _BUILT_IN: Final = {

@@ -5,6 +5,7 @@ MPU-9250: RM-MPU-9250A and PS-MPU-9250A. The sensor takes the gyro's samples by 
 FIFO, so a late reader loses no rotation.
 """
 
+from collections.abc import Callable
 from typing import ClassVar, Final
 
 import numpy as np
@@ -12,11 +13,12 @@ from numpy.typing import NDArray
 
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock
-from rig.core.errors import ConfigError, DeviceFault
+from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch
 from rig.devices.i2c import AnyBus
-from rig.devices.imu import FifoTimes, I2cImu, ImuSamples
+from rig.devices.imu import FifoTimes, I2cImu, Imu, ImuSamples
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
+_GYRO_CONFIG, _GYRO_SELF_TEST = 0x1B, 0xE0  # all three axes, at 250 °/s
 _USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W = 0x6A, 0x6B, 0x72, 0x74
 
 _DEVICE_RESET, _ASLEEP, _CLOCK_PLL_GYRO_X = 0x80, 0x40, 0x01
@@ -31,6 +33,13 @@ LSB_PER_G = 16384.0
 LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}  # by the full scale
 _FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}
 """DLPF_CFG by the gyro's bandwidth in Hz; all run at an internal rate of 1 kHz."""
+
+_TESTED_SAMPLES, _TESTED_S = 50, 2.0
+"""Number of samples of a clone that are tested, and longest time for them: 50 samples fit into any of the FIFOs."""
+_SELF_TEST_DPS = (5.0, 220.0)
+"""Smallest and largest response to the self-test; that of an MPU-6050 is 25 to 101 °/s by its factory trim (RM 4.1)."""
+_SELF_TEST_SAMPLES = 4, 20  # at least, and within a second
+_WILD_DPS = 20.0  # standard deviation that no table at rest shows
 
 
 class Mpu6050(I2cImu):
@@ -201,15 +210,69 @@ class Mpu9250(Mpu6500):
 
 
 class Mpu6050Clone(Mpu6050):
-    """A clone of the MPU-6050 that has no datasheet.
+    """A clone of the MPU-6050 that has no datasheet. Opening it also tests its samples at rest.
 
     The driver assumes the worst values of the family: the smallest FIFO and the largest noise. The temperature has the
-    MPU-6050's scale. Another rate shows as lost samples, another scale in the first motion.
+    MPU-6050's scale.
+
+    Raises `DeviceMismatch`: its samples come at another rate, are all equal or wild, gravity is not 1 g, or its gyro
+    does not respond to its self-test.
     """
 
     KIND = imu_kind("mpu6050_clone")
     FIFO_BYTES = 512
     NOISE_DPS_RTHZ = 0.01
+
+    def _set_up(self) -> None:
+        super()._set_up()
+        check_clone(self, self._clock, f"of {self._registers.name}", self._self_test)
+
+    def _self_test(self, at_rest_dps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the change of each axis of the gyro during its self-test, (3,), in °/s."""
+        self._registers.write(_GYRO_CONFIG, _GYRO_SELF_TEST)
+        self._empty_fifo()
+        least, most = _SELF_TEST_SAMPLES
+        count = max(least, min(most, round(self.rate_hz)))
+        self._clock.sleep(count / self.rate_hz)
+        words = self._registers.read(_FIFO_R_W, self._fifo_count() // _FRAME * _FRAME)
+        self._registers.write(SMPLRT_DIV, *self._settings[SMPLRT_DIV])
+        self._empty_fifo()
+        late = np.frombuffer(words, ">i2").reshape(-1, 3)[count // 2 :]  # after the low-pass has settled
+        return late.mean(axis=0) / LSB_PER_DPS[250] - at_rest_dps if len(late) else np.zeros(3)
+
+
+def check_clone(
+    imu: Imu, clock: Clock, place: str, self_test: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+) -> None:
+    """Test the samples of a clone at rest, gravity, and with ``self_test`` its response; see `Mpu6050Clone`."""
+    due = min(float(_TESTED_SAMPLES), _TESTED_S * imu.rate_hz)
+    imu.read_samples()
+    clock.sleep(due / imu.rate_hz)
+    samples, gravity_g = imu.read_samples(), float(np.linalg.norm(imu.read_gravity_g()))
+    got, rates = len(samples.time_ns), samples.gyro_dps
+    noise_dps = float(rates.std(axis=0).max()) if got else 0.0
+    problems = []
+    if samples.lost or abs(got - due) > 0.1 * due + 2:
+        problems.append(f"it took {got} samples instead of {due:.0f}")
+    elif noise_dps == 0.0:
+        problems.append("all its samples are equal")
+    elif noise_dps > _WILD_DPS:
+        problems.append(f"its rates scatter by {noise_dps:.0f} °/s")
+    if not 0.8 < gravity_g < 1.2:
+        problems.append(f"gravity is {gravity_g:.2f} g")
+    # Its self-test, only if the samples can be trusted.
+    if self_test is not None and not problems:
+        response_dps, (low_dps, high_dps) = self_test(rates.mean(axis=0)), _SELF_TEST_DPS
+        if not all(low_dps <= abs(one) <= high_dps for one in response_dps):
+            shown = ", ".join(f"{one:.0f}" for one in response_dps)
+            problems.append(f"its gyro responds with {shown} °/s to its self-test")
+    if problems:
+        raise DeviceMismatch(
+            f"The clone at I2C address {imu.identity.bus_address:#04x} {place} does not behave as an MPU-6050: "
+            f"{'; '.join(problems)}.",
+            next_step="Keep the table still and open the bench again. If it fails again, use another sensor.",
+            evidence={"samples": got, "expected": due, "noise_dps": noise_dps, "gravity_g": gravity_g},
+        )
 
 
 DRIVERS: Final = {driver.KIND.key: driver for driver in (Mpu6050, Mpu6500, Mpu9250, Mpu6050Clone)}

@@ -59,10 +59,13 @@ class SimMpu6050(SimulatedImu):
     BANDWIDTH_HZ: ClassVar[tuple[float, ...]] = BANDWIDTH_HZ
     LSB_PER_C: ClassVar[float] = 340.0  # RM-MPU-6000A, 4.18
     ZERO_C: ClassVar[float] = 36.53
+    SELF_TEST_DPS: ClassVar[tuple[float, float, float]] = (58.0, -58.0, 58.0)
+    """Change of the gyro's reading during its self-test (PS 6.1, RM 4.1: 25 to 101 °/s by the factory trim)."""
     STAYS = FIFO_R_W
 
     def __init__(self, world: World, *, address: int = 0x68, who_am_i: int | None = None) -> None:
         self.who_am_i = self.IDENTITY if who_am_i is None else who_am_i
+        self.self_test_dps = np.array(self.SELF_TEST_DPS)
         super().__init__(world, address)
 
     @property
@@ -175,6 +178,8 @@ class SimMpu6050(SimulatedImu):
 
     def _quantised(self, gyro: Floats, accel: Floats, die_c: Floats) -> Words:
         """Return the samples (n, 7) as the big-endian words of the data registers, saturated."""
+        under_test = [self._registers[GYRO_CONFIG] >> bit & 1 for bit in (7, 6, 5)]  # XG_ST, YG_ST, ZG_ST
+        gyro = gyro + np.array(under_test) * self.self_test_dps
         values = np.empty((len(gyro), 7))
         values[:, :3] = accel * LSB_PER_G[self._registers[ACCEL_CONFIG] >> 3 & 3]
         values[:, 3] = (die_c - self.ZERO_C) * self.LSB_PER_C

@@ -50,6 +50,7 @@ from rig.devices.head.protocol import (
 )
 from rig.devices.head.samples import HeadClock, HeadSensor, SampleStream, head_sensor
 from rig.devices.imu import ImuIdentity, ImuSamples, another_sensor
+from rig.devices.mpu6050 import Mpu6050Clone, check_clone
 
 POWER_UP_S = 0.6
 """Time from closing the relay of the servo's supply until the servo answers."""
@@ -147,6 +148,8 @@ class RigHead:
             self._wait_until_running()
             # Beside the work, not in its control loop: a slow disk or the operator takes longer than a deadman.
             self._cancel = clock.every(deadman_s / HEARTBEATS_PER_DEADMAN, self._in_background)
+            if sensor.kind is Mpu6050Clone.KIND:
+                check_clone(self, clock, f"of the rig head at {name}")
         except BaseException:
             self.close()
             raise

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -89,13 +90,39 @@ def test_mpu6500_that_is_awake_after_a_reset_is_a_fault() -> None:
             imu.read_gravity_g()
 
 
-def test_clone_with_another_rate_reports_lost_samples() -> None:
-    with ImuBench(NoiseModel(), who_am_i=0x98, device=SimMpu6050Clone) as bench:
-        bench.sensor.clock_error = -0.5
-        imu = bench.open(Mpu6050Clone)
-        assert (imu.identity.model, imu.identity.who_am_i) == ("MPU-6050 clone", 0x98)
-        bench.clock.sleep(0.2)
-        assert imu.read_samples().lost == pytest.approx(20, abs=3)
+@pytest.mark.parametrize(
+    ("who_am_i", "rate_hz", "device"),
+    [(0x72, 4.0, SimMpu6050), (0x98, 200.0, SimMpu6050Clone), (0x72, 1000.0, SimMpu6050Clone)],
+)
+def test_clone_with_plausible_samples_is_accepted(who_am_i: int, rate_hz: float, device: type[SimMpu6050]) -> None:
+    with ImuBench(NoiseModel(), who_am_i=who_am_i, device=device) as bench:
+        imu = bench.open(Mpu6050Clone, rate_hz=rate_hz)
+        assert (imu.identity.model, imu.identity.who_am_i) == ("MPU-6050 clone", who_am_i)
+        bench.clock.sleep(max(0.03, 4 / rate_hz))
+        samples = imu.read_samples()  # the self-test is over
+        assert len(samples.time_ns) >= 3
+        assert np.abs(samples.gyro_dps).max() < 25
+
+
+@pytest.mark.parametrize(
+    ("spoil", "problem"),
+    [
+        (lambda sensor: setattr(sensor, "clock_error", -0.5), "samples instead of 50"),
+        (
+            lambda sensor: sensor.distortions.append(lambda words: words * np.array([1, 1, 1, 1, 0, 0, 0], ">i2")),
+            "all its samples are equal",
+        ),
+        (lambda sensor: setattr(sensor.inertial, "accel_bias_g", sensor.inertial.up), "gravity is 2.0"),
+        (lambda sensor: sensor.distortions.append(lambda words: words[::-1] * np.int16(300)), "scatter"),
+        (lambda sensor: setattr(sensor, "self_test_dps", np.array([58.0, 0.0, 58.0])), "to its self-test"),
+    ],
+    ids=["rate", "frozen", "gravity", "noise", "self-test"],
+)
+def test_clone_with_implausible_samples_is_rejected(spoil: Any, problem: str) -> None:
+    with ImuBench(NoiseModel(), device=SimMpu6050Clone) as bench:
+        spoil(bench.sensor)
+        with pytest.raises(DeviceMismatch, match=problem):
+            bench.open(Mpu6050Clone)
 
 
 @pytest.mark.parametrize(
