@@ -424,6 +424,14 @@ class IdentifyConfig(Section):
     first_step_deg: float = Field(
         90.0, ge=-180, le=180, description="rotation between the first two views; positive is counter-clockwise"
     )
+    omega: float = Field(0.5, ge=0, le=100, description="weight of the orientation term")
+    list_length: int = Field(10, ge=1, le=1000, description="views on a retrieval list")
+    index: Literal["flat", "tree"] = Field(
+        "flat", description="search for similar views: flat: compares all, tree: the paper's KD-tree; same answers"
+    )
+    extension: Literal["visual", "orient", "orient_all"] = Field(
+        "orient_all", description="how missing views are filled in"
+    )
     record: Literal["image", "answer", "none"] = Field(
         "image",
         description="what the catalog records of each answer: with the image of the first view, without, or nothing",

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.devices.v4l2 import VideoMode
+from rig.devices.v4l2 import VideoControl, VideoMode
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,10 @@ class Capture(Protocol):
     def release(self) -> None: ...
     def modes(self) -> tuple[VideoMode, ...]:
         """Return the modes that the source offers; empty if it does not tell."""
+        return ()
+
+    def offered_controls(self) -> tuple[VideoControl, ...]:
+        """Return the controls that the source offers, with their present values; empty if it does not tell."""
         return ()
 
     def limits(self, propId: int, /) -> tuple[float, float] | None:  # noqa: ARG002

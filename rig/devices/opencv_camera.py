@@ -174,6 +174,11 @@ class OpenCvCamera:
                     evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
                 )
 
+    @property
+    def controls(self) -> tuple[v4l2.VideoControl, ...]:
+        """The controls that the camera offers, with their present values; none if the source does not tell."""
+        return self._capture.offered_controls()
+
     def read_locks(self) -> CameraLocks:
         reported = {name: (convert, self._known(prop)) for name, (prop, convert) in _LOCKS.items()}
         return CameraLocks(**{name: value if value is None else to(value) for name, (to, value) in reported.items()})

@@ -64,6 +64,9 @@ class OpenedCapture(Capture):
     def modes(self) -> tuple[v4l2.VideoMode, ...]:
         return () if self._path is None else v4l2.modes(self._path)
 
+    def offered_controls(self) -> tuple[v4l2.VideoControl, ...]:
+        return () if self._path is None else v4l2.controls(self._path)
+
     def limits(self, propId: int, /) -> tuple[float, float] | None:
         if self._path is None or propId not in _CONTROLS:
             return None

@@ -227,5 +227,6 @@ def imu_notes(imu: Imu, clock: Clock) -> dict[str, Any]:
 
 
 def camera_notes(camera: Camera) -> dict[str, Any]:
-    """Return the modes that a camera offers, and the settings that it reports."""
-    return {"modes": plain(getattr(camera, "modes", ())), **asdict(camera.read_locks())}
+    """Return the modes, the controls and the settings that a camera reports."""
+    offered = {name: plain(getattr(camera, name, ())) for name in ("modes", "controls")}
+    return {**offered, **asdict(camera.read_locks())}

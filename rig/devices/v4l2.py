@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from fcntl import ioctl
 from pathlib import Path
+from typing import Any
 
 CAPTURE, CAPTURE_MPLANE = 0x0000_0001, 0x0000_1000
 M2M_MPLANE, M2M = 0x0000_4000, 0x0000_8000
@@ -26,7 +27,8 @@ _VIDEO_CAPTURE, _DISCRETE = 1, 1
 _MOST_ENTRIES = 64  # a driver that never answers EINVAL must not hold the program
 _G_CTRL, _S_CTRL, _QUERYCTRL = 0xC008_561B, 0xC008_561C, 0xC044_5624
 _CONTROL = struct.Struct("Ii")
-_RANGE = struct.Struct("II32s3i16x")  # number, type, name; minimum, maximum, step; default value, flags, reserved
+_RANGE = struct.Struct("II32s4iI8x")  # number, type, name; minimum, maximum, step, default value; flags
+_NEXT, _DISABLED, _CLASS = 0x8000_0000, 0x0001, 6
 _CAPABILITY = struct.Struct("16s32s32s6I")  # driver, card, bus; version, capabilities of the driver and of this node
 
 
@@ -128,10 +130,41 @@ def get_control(path: Path, control: int) -> int | None:
     return None if answer is None else int(_CONTROL.unpack(answer)[1])
 
 
-def control_limits(path: Path, control: int) -> tuple[float, float] | None:
+@dataclass(frozen=True, slots=True)
+class VideoControl:
+    """A control that a camera offers, with its present value (None: it cannot be read)."""
+
+    number: int
+    name: str
+    minimum: int
+    maximum: int
+    step: int
+    default: int
+    value: int | None
+
+
+def controls(path: Path) -> tuple[VideoControl, ...]:
+    """Return the controls of a device, in the order of their numbers."""
+    found: list[VideoControl] = []
+    number = 0
+    while (answer := _range(path, number | _NEXT)) is not None and answer[0] > number:  # a driver may repeat itself
+        number, kind, name, low, high, step, default, flags = answer
+        if kind != _CLASS and not flags & _DISABLED:
+            text = name.split(b"\0")[0].decode("ascii", "replace")
+            found.append(VideoControl(number, text, low, high, step, default, get_control(path, number)))
+    return tuple(found)
+
+
+def control_limits(path: Path, control: int) -> tuple[int, int] | None:
     """Return the smallest value and the step of a control; None if the device lacks it."""
-    answer = _ask(path, _QUERYCTRL, _RANGE.pack(control, 0, b"", 0, 0, 0))
-    return None if answer is None else _RANGE.unpack(answer)[3::2]
+    answer = _range(path, control)
+    return None if answer is None else (answer[3], answer[5])
+
+
+def _range(path: Path, number: int) -> tuple[Any, ...] | None:
+    """Return the fields of `_RANGE` of a control; None if there is none."""
+    answer = _ask(path, _QUERYCTRL, _RANGE.pack(number, 0, b"", 0, 0, 0, 0, 0))
+    return None if answer is None else _RANGE.unpack(answer)
 
 
 def set_control(path: Path, control: int, value: int) -> bool:

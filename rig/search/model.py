@@ -78,6 +78,7 @@ def _index(views: hbr.Views) -> hbr.ViewIndex | hbr.DenseIndex:
     return hbr.ViewIndex(views if len(views) else hbr.Views.empty())
 
 
+_tree = lru_cache(maxsize=4)(partial(hbr.ViewIndex, method="tree"))  # built once for each model
 _poses = lru_cache(maxsize=4)(PoseModel)  # built once for each model
 
 
@@ -106,7 +107,7 @@ def begin_search(
     if isinstance(model.index, hbr.ViewIndex):
         if getattr(chosen, "poses", False):
             return PoseSearch(*common, _poses(model.views))
-        return HoughSearch(*common, model.index)
+        return HoughSearch(*common, _tree(model.views) if config.identify.index == "tree" else model.index)
     if getattr(chosen, "in_motion", False):
         return DenseSearch(*common, ArcSession(model.index))
     return DenseSearch(*common, hbr.DenseSession(model.index, max_views=config.identify.max_views))

@@ -310,7 +310,15 @@ class HoughSearch(PaperSearch):
 
     def _rank(self) -> Ranked:
         self.queries = queries = np.array(self._descriptors)
-        self.ranking = ranking = hbr.retrieve(queries, np.array(self._orientations), self.index)
+        config = self.config.identify
+        self.ranking = ranking = hbr.retrieve(
+            queries,
+            np.array(self._orientations),
+            self.index,
+            omega=config.omega,
+            list_length=config.list_length,
+            extension=config.extension,
+        )
         views = len(queries)
         candidates = tuple(
             Candidate(name, float(score) / views, float(pose_deg))

@@ -1,6 +1,7 @@
 """Modes of a camera, as its driver lists them, and the choice among them."""
 
 import errno
+import struct
 from pathlib import Path
 
 import pytest
@@ -68,3 +69,33 @@ def test_uncompressed_mode_is_chosen_if_it_is_fast_enough(monkeypatch, tmp_path)
     assert str(choose_mode(offered, 800, 600, 30, "MJPG")) == "640x480 at 30 frames/s (MJPG)"
     assert choose_mode((), 640, 480, 30) is None
     assert choose_mode([VideoMode("H264", 640, 480, 30)], 640, 480, 30) is None
+
+
+def test_controls_are_listed_with_their_ranges_and_values(monkeypatch, tmp_path):
+    node = tmp_path / "video0"
+    node.touch()
+    offered = {
+        0x98_0001: (6, b"User Controls", 0, 0, 0, 0, 0),  # the title of a class
+        0x98_0900: (1, b"Brightness", -64, 64, 1, 0, 0),
+        0x98_0901: (1, b"Disabled", 0, 1, 1, 0, 1),
+        0x9A_0902: (1, b"Exposure Time, Absolute", 3, 2047, 1, 250, 0x10),
+    }
+
+    def answer(_file, request, argument):
+        if request == 0xC008561B:
+            number, _ = struct.unpack("Ii", argument)
+            return struct.pack("Ii", number, 7)
+        assert request == 0xC0445624
+        before = int.from_bytes(argument[:4], "little") & 0x7FFFFFFF
+        following = next((number for number in offered if number > before), None)
+        if following is None:
+            raise OSError(errno.EINVAL, "no more")
+        kind, name, *numbers = offered[following]
+        return struct.pack("II32s4iI8x", following, kind, name, *numbers)
+
+    monkeypatch.setattr(v4l2, "ioctl", answer)
+    assert v4l2.controls(node) == (
+        v4l2.VideoControl(0x98_0900, "Brightness", -64, 64, 1, 0, 7),
+        v4l2.VideoControl(0x9A_0902, "Exposure Time, Absolute", 3, 2047, 1, 250, 7),
+    )
+    assert v4l2.controls(Path("/nowhere")) == ()

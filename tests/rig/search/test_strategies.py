@@ -104,6 +104,17 @@ def test_score_below_min_score_ends_no_search_early():
     assert [isinstance(step, Finish) for step in steps] == [False] * 4 + [True]
 
 
+def test_the_tree_gives_the_same_answers():
+    known = model(objects=9)
+    for row in known.descriptors[::7]:
+        found = []
+        for index in ("flat", "tree"):
+            search = searching(known, "ahbr", index=index)
+            found.append(added(search, row, 0.0, table_deg=0.0)[0])
+            assert search.index.method == index
+        assert found[0] == found[1]
+
+
 def test_empty_catalog_and_an_unknown_strategy_are_rejected():
     with pytest.raises(CatalogError, match="empty"):
         searching(hbr.Views.empty(), "ahbr")
