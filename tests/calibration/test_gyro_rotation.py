@@ -47,5 +47,5 @@ def test_simulated_sigma_is_true_and_a_noisy_encoder_is_rejected(simulated):
     by_duration = result.evidence["by_duration"]
     assert [row["stated_deg"] for row in by_duration] == sorted(row["stated_deg"] for row in by_duration)
     assert by_duration[-1]["seconds"] > 5 * by_duration[0]["seconds"]
-    *_, noisy = GyroRotation(repeats=4).live(simulated(noise=NoiseModel(encoder_noise_deg=0.25), seed=3).bench)
+    *_, noisy = GyroRotation(repeats=4).live(simulated(noise=NoiseModel(encoder_noise_deg=0.18), seed=3).bench)
     assert RejectionCode.SCATTER_TOO_LARGE in codes(noisy)
