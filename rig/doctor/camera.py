@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
-from rig.core.next_steps import Do, SomeSteps
+from rig.core.next_steps import Do, NextStep, SomeSteps
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.v4l2 import choose_mode
 from rig.doctor.examination import DoctorContext
@@ -21,15 +21,16 @@ from rig.views.capture import ImageQuality, rejection_text
 
 LOCKABLE = (
     *("exposure_us", "white_balance_k", "gain", "focus", "sharpness"),
-    *("backlight_compensation", "power_line_frequency"),
+    *("backlight_compensation", "power_line_frequency", "dynamic_frame_rate"),
 )
 """Settings that a camera reports, by their keys in ``[camera]``."""
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
 """Largest time from the start of an exposure until the program has the frame; the table waits for it at each view."""
-STRIPS = 24  # a readout of 67 ms, a long one, shows 8 bands of a lamp at 60 Hz mains: three strips show each
-MAX_FLICKER = 0.05  # largest spread of the level of a strip in frames of one scene
+EXPOSURE_STEP_US = 100.0
+"""Cameras round exposure times to this step."""
+MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
 
 
 def camera(context: DoctorContext) -> Iterator[Finding]:
@@ -107,7 +108,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         "white_balance_k": locks.auto_white_balance,
         "gain": locks.gain is not None and context.config.camera.gain is None,
         "focus": locks.autofocus,
-        "frame rate": locks.dynamic_frame_rate,
+        "dynamic_frame_rate": locks.dynamic_frame_rate,
     }
     not_locked = [name for name, loose in is_loose.items() if loose]
     if not_locked:
@@ -121,6 +122,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
 def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     clock = context.computer.clock
     frames: list[NDArray[np.uint8]] = []
+    times_ns = []
     ages = []
     # First frames as fast as they come, for the rate; then frames apart, for changes of the light.
     after_ns = start_ns = clock.now_ns()
@@ -129,6 +131,7 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         frame = source.capture(after_ns)
         ages.append(seconds_between(frame.exposed_ns, clock.now_ns()))
         frames.append(frame.image_bgr)
+        times_ns.append(frame.exposed_ns)
         if number == QUICK - 1:
             rate = QUICK / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
@@ -152,16 +155,7 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         yield warning("few_frames", f"{text}, not {{fps:.3g}}", fix, fps=source.identity.fps, **evidence)
     else:
         yield fine("frames", text, **evidence)
-    # A rolling shutter shows a lamp at the mains as bands that move from image to image, so each strip counts alone.
-    strips = np.array([[part.mean() for part in np.array_split(frame, STRIPS)] for frame in frames])
-    spread = float(np.ptp(strips, axis=0).max() / strips.mean())
-    if spread > MAX_FLICKER:
-        text = "the light changes by {spread:.0%} within {seconds:.0f} s"
-        fix = (
-            "Lamps flicker with the mains: set camera.exposure_us to whole periods of the lamp, 10000 at 50 Hz or 8333 "
-            "at 60 Hz. Keep daylight and shadows away"
-        )
-        yield warning("flicker", text, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
+    yield from _flicker(source.read_locks().exposure_us, frames, np.array(times_ns), evidence)
     # Would an enrollment accept this view?
     quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
@@ -178,3 +172,95 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
             "{saturated_share:.1%} saturated"
         )
         yield fine("view_accepted", text, **quality)
+
+
+# -- lamps that flicker with the mains: the bands that they leave in the images of a rolling shutter -------------------
+
+MAINS_HZ = (50.0, 60.0)  # a lamp flickers at twice this rate
+MIN_DEPTH = 0.01
+"""Smallest amplitude, as a share of the mean level, that counts."""
+_MIN_EXPLAINED = 0.6  # less: something else changes the light, such as a person who passes
+_STANDS = 0.1
+"""Variance of the lamp's phase from image to image below which bands stand still; 1 if all phases occur."""
+_CYCLES = np.arange(0.0, 8.01, 0.125)
+"""Bands in an image: at most 8, for a readout of 67 ms at 120 Hz."""
+_BLOCKS = 48  # six for each band at most; more blocks are noisier
+
+
+class MainsFlicker(NamedTuple):
+    """Flicker at twice the mains frequency; ``depth`` is its amplitude as a share of the mean level."""
+
+    mains_hz: float
+    depth: float
+
+
+def whole_periods_us(mains_hz: float, wanted_us: float) -> float:
+    """Return the exposure time without bands that is nearest to ``wanted_us``: whole periods of the lamp."""
+    period_us = 1e6 / (2 * mains_hz)
+    return float(round(max(round(wanted_us / period_us), 1) * period_us))
+
+
+def mains_flicker(row_levels: NDArray[np.float64], times_ns: NDArray[np.int64]) -> MainsFlicker | None:
+    """Return the flicker of a still scene; None if there is none.
+
+    The row at the share y of the height is exposed later by y times the readout. So a lamp with the frequency f adds
+    cos(2π (f t + c y)) to the image at time t, with c bands. Both are fitted to the changes of each row. Bands that
+    stand still, because f is a multiple of the frame rate, cannot be told from the scene: see `standing_mains_hz`.
+
+    ``row_levels``, float64 (n, H), is the mean level of each row of n images at ``times_ns``, int64 (n,).
+    """
+    count, height = row_levels.shape
+    if count < 4 or height < _BLOCKS:
+        return None
+    blocks = row_levels[:, : height - height % _BLOCKS].reshape(count, _BLOCKS, -1).mean(axis=-1)
+    changes = blocks / np.maximum(blocks.mean(axis=0), 1.0) - 1.0
+    power = float((changes**2).mean())
+    if power == 0.0:
+        return None
+    bands = np.exp(-2j * np.pi * np.outer((np.arange(_BLOCKS) + 0.5) / _BLOCKS, _CYCLES))
+    best = MainsFlicker(0.0, 0.0)
+    for mains_hz in MAINS_HZ:
+        phases = _phases(mains_hz, times_ns)
+        if (weight := float((np.abs(phases) ** 2).mean())) >= _STANDS:
+            fitted = np.abs(phases @ changes @ bands).max() / (count * _BLOCKS * weight)
+            best = max(best, MainsFlicker(mains_hz, 2 * float(fitted)), key=lambda one: one.depth)
+    explained = best.depth**2 / 2 / power
+    return best if best.depth >= MIN_DEPTH and explained >= _MIN_EXPLAINED else None
+
+
+def standing_mains_hz(times_ns: NDArray[np.int64]) -> tuple[float, ...]:
+    """Return the mains frequencies whose bands stand still in images of these times, int64 (n,)."""
+    return tuple(hz for hz in MAINS_HZ if (np.abs(_phases(hz, times_ns)) ** 2).mean() < _STANDS)
+
+
+def _phases(mains_hz: float, times_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
+    """Return the lamp's phase in each image as a complex number, without the mean, which is part of the scene."""
+    phases = np.exp(-2j * np.pi * 2 * mains_hz * (times_ns - times_ns[0]) * 1e-9)
+    return np.asarray(phases - phases.mean())
+
+
+def _flicker(
+    exposure_us: float | None, frames: list[NDArray[np.uint8]], times_ns: NDArray[np.int64], evidence: dict[str, Any]
+) -> Iterator[Finding]:
+    levels = evidence["mean_levels"]
+    spread = (max(levels) - min(levels)) / max(levels)
+    # Every second column of the green channel is enough for the levels of rows.
+    lamp = mains_flicker(np.array([frame[:, ::2, 1].mean(axis=1) for frame in frames]), times_ns)
+    without = "an exposure of whole periods of the lamp has none"
+    if lamp is not None:
+        text = "the lamps flicker with the mains ({mains_hz:.0f} Hz): bands of {depth:.0%} in the images; " + without
+        yield warning("mains_flicker", text, _exposure_without_bands(lamp.mains_hz, exposure_us), **lamp._asdict())
+    elif spread > MAX_FLICKER:
+        text = "the light changes by {spread:.0%} within {seconds:.0f} s"
+        fix = "Use a lamp that does not flicker, and keep daylight and shadows away"
+        yield warning("flicker", text, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
+    else:
+        for hz in standing_mains_hz(times_ns):
+            if exposure_us is None or abs(whole_periods_us(hz, exposure_us) - exposure_us) > EXPOSURE_STEP_US:
+                seen = "bands of lamps at {mains_hz:.0f} Hz mains would stand still in the images, and are not checked"
+                step = _exposure_without_bands(hz, exposure_us)
+                yield fine("standing_flicker_not_checked", f"{seen}; {without}", step, mains_hz=hz)
+
+
+def _exposure_without_bands(mains_hz: float, exposure_us: float | None) -> NextStep:
+    return Do.SET_KEY(key="camera.exposure_us", value=f"{whole_periods_us(mains_hz, exposure_us or 1e4):g}")

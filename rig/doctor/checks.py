@@ -3,8 +3,12 @@
 from collections.abc import Iterator
 from typing import Any
 
+from sqlalchemy import select
+
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus
 from rig.catalog import Catalog
+from rig.catalog.facts import View
+from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 from rig.doctor import computer
 from rig.doctor.camera import camera
@@ -13,9 +17,11 @@ from rig.doctor.finding import Finding, bad, fine, graded, of_error, warning
 from rig.doctor.imu import imu
 from rig.doctor.servo import servo
 
+IMAGES = 24  # number of images that are verified; `rig catalog verify` verifies all
+
 
 def catalog(context: DoctorContext) -> Iterator[Finding]:
-    """Check that the catalog can be opened, and that its database is undamaged; `rig catalog verify` reads images."""
+    """Check that the catalog can be opened, and that its database and some of its images are undamaged."""
     place = context.config.catalog_place(context.bench)
     path = place if place.url is not None else place.path
     if not place.may_exist():
@@ -30,15 +36,28 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
             yield bad("database_damaged", text, Do.VERIFY_CATALOG(), path=path, damage=damage)
         if (changed := opened.damage()) is not None:
             raise changed
+        with opened.database.read() as transaction:
+            stored = transaction.scalars(select(View.image).order_by(View.id)).all()
+        chosen = stored[:: max(len(stored) // IMAGES, 1)][:IMAGES]  # spread over the catalog
+        broken = []
+        for image in chosen:
+            try:
+                opened.read_image(image)
+            except CatalogError as error:
+                broken.append(error.what)
+        if broken:
+            text = "{broken} of {images} verified images are damaged: {first}"
+            found: dict[str, Any] = {"broken": len(broken), "images": len(chosen), "first": broken[0]}
+            yield bad("images_damaged", text, Do.VERIFY_CATALOG(), **found)
         objects = opened.objects()
         unfinished = [item.name for item in objects if item.unfinished_views is not None]
         if unfinished:
             fix = Do.CONTINUE_ENROLLMENT(name=unfinished[0])
             yield warning("unfinished", "unfinished enrollments: {objects}", fix, objects=unfinished)
-        if not damage:
-            text = "{path}: {objects} objects, {views} views; database undamaged"
-            views = sum(item.views for item in objects)
-            yield fine("catalog", text, path=path, objects=len(objects), views=views)
+        if not damage and not broken:
+            text = "{path}: {objects} objects, {views} views; database undamaged, {images} images verified"
+            found = {"objects": len(objects), "views": sum(item.views for item in objects), "images": len(chosen)}
+            yield fine("catalog", text, path=path, **found)
 
 
 def calibrations(context: DoctorContext) -> Iterator[Finding]:

@@ -224,7 +224,7 @@ SCENARIOS: dict[str, Scenario] = {
         stopped("blur@move3", 600, "variance of the Laplacian", "focus the camera"),
         stopped("exposure_jump@move3", 600, "the exposure settings, read with every frame", "reconnect the camera"),
         survived("light_flicker", "not detected at this depth: it hardly changes CEDD; views store their mean level"),
-        survived("mains_flicker", "not visible at the default exposure of 10 ms; `rig doctor` finds it at others"),
+        survived("mains_flicker", "not visible at the default exposure of 10 ms; `rig doctor` names it at others"),
         # -- object and computer ---------------------------------------------------------------------------------
         stopped(
             "object_falls@move3",

@@ -8,6 +8,7 @@ import pytest
 
 from rig.bench.computer import Computer
 from rig.config import CameraConfig
+from rig.core.next_steps import Do
 from rig.devices import v4l2
 from rig.devices.opencv_camera import NO_CONTROL, OpenCvCamera
 from rig.devices.opencv_capture import OpenedCapture
@@ -87,6 +88,21 @@ def test_limits_of_a_control_are_those_of_the_driver(monkeypatch: pytest.MonkeyP
     assert capture.limits(cv2.CAP_PROP_GAIN) == (1, 1)
     assert capture.limits(cv2.CAP_PROP_WB_TEMPERATURE) == (2800, 100)
     assert capture.limits(cv2.CAP_PROP_FOCUS) is capture.limits(cv2.CAP_PROP_FPS) is None
+
+
+def test_doctor_names_what_a_camera_lacks_with_the_setting_that_accepts_it() -> None:
+    with unopened() as bench:
+        bench.devices.camera = ModelledWebcam(bench.devices.world, WEBCAMS["trust_webcam"])
+        found = bench.findings("camera")
+        assert "not_locked" not in {one.code for one in found}
+        problems = {one.evidence["setting"]: one for one in found if one.code == "setting_rejected"}
+        assert list(problems) == ["exposure_100us", "white_balance_k"]
+        assert problems["exposure_100us"].steps[-1] == Do.SET_KEY(key="camera.exposure_us", value="none")
+    with unopened("camera.fourcc=HEVC") as bench:
+        bench.devices.camera = ModelledWebcam(bench.devices.world, WEBCAMS["elp_h265"])
+        problem = next(one for one in bench.findings("camera") if one.code == "mode_not_offered")
+        assert problem.steps == (Do.SET_KEY(key="camera.fourcc", value="none"),)
+        assert "(HEVC); nearest: 640x480 at 30 frames/s (YUYV)" in problem.words
 
 
 class Decodes(ModelledWebcam):

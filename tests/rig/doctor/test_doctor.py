@@ -170,17 +170,11 @@ def test_camera_is_reported_as_locked_only_by_settings_that_were_read_back():
 
     locked = camera()["locked"].evidence["settings"]
     assert locked[:4] == ["exposure_us 10000", "white_balance_k 5000", "gain 0", "focus 120"]
+    assert "dynamic_frame_rate 0" in locked
     found = camera("camera.gain=none", "camera.sharpness=999")
     assert found["not_locked"].evidence["settings"] == ["gain"]
     assert found["setting_rejected"].evidence["setting"] == "sharpness"
     assert not [text for text in found["locked"].evidence["settings"] if text.startswith(("gain", "sharp"))]
-
-
-@pytest.mark.parametrize(("exposure_us", "problems"), [(5_000, ["flicker"]), (10_000, [])])
-def test_lamps_that_flicker_with_the_mains_are_found_unless_the_exposure_hides_them(exposure_us, problems):
-    with unopened(f"camera.exposure_us={exposure_us}") as bench:
-        Faults(bench.devices).schedule(Fault.parse("mains_flicker"))
-        assert list(bench.problems("camera")) == problems
 
 
 def test_imu_of_another_address_axis_or_kind_is_found():
@@ -267,6 +261,12 @@ def test_catalog_is_checked(bench):
     (finding,) = bench.findings("catalog")
     assert (finding.level, finding.code) == (Severity.FINE, "catalog")
     assert (finding.evidence["objects"], finding.evidence["views"]) == (1, 6)
+    image = next((path / "images").rglob("*.png"))
+    image.write_bytes(b"no image")
+    problem = bench.problem("catalog")
+    assert (problem.code, problem.steps) == ("images_damaged", (Do.VERIFY_CATALOG(),))
+    assert (problem.evidence["broken"], problem.evidence["images"]) == (1, 6)
+    image.unlink()
     (path / "catalog.sqlite").write_bytes(b"SQLite format 3\0" + b"rubbish" * 999)
     (finding,) = bench.findings("catalog")
     assert finding.level is Severity.BAD
