@@ -82,7 +82,7 @@ def test_every_command_and_option_exists():
 
 def test_tables_list_the_common_options_and_the_exit_codes():
     options = re.findall(r"^\| `(--[a-z-]+)", GUIDES["call-the-rig"], re.MULTILINE)
-    assert sorted(options) == sorted(["--bench", "--config", "--set", "--seed", "--json"])
+    assert sorted(options) == sorted(["--bench", "--config", "--set", "--seed", "--json", "--no-color"])
     codes = re.findall(r"^\| ([\d, ]+) \|", GUIDES["call-the-rig"], re.MULTILINE)
     assert set(EXIT_CODES) <= {int(code) for cell in codes for code in cell.split(",")}
 

@@ -82,7 +82,7 @@ def key_info(model: type[BaseModel], above: Key = ()) -> Iterator[KeyInfo]:
 
 def blank_file(model: type[BaseModel]) -> str:
     """Return a configuration file that sets nothing: each key with its default and meaning, as a comment."""
-    lines = ["# Configuration of the rig. Remove the # to set a key. `rig config show` checks the file."]
+    lines = ["# Configuration of the rig. Remove the # to set a key. `rig config check` checks the file."]
     section: Key = ()
     for info in key_info(model):
         if isinstance(info.default, dict):

@@ -70,7 +70,7 @@ class Do(StrEnum):
     CALIBRATE = "calibrate", "run the calibration {name}", "rig calibrate {name}"
     # the configuration and the computer
     SET_KEY = "set-key", "set {key} to {value}", "rig config set {key} {value}"
-    CHECK_CONFIGURATION = "check-configuration", "check the configuration", "rig config show"
+    CHECK_CONFIGURATION = "check-configuration", "check the configuration", "rig config check"
     SHOW_CONFIGURATION = "show-configuration", "list the keys and their values", "rig config show"
     FREE_DISK = "free-disk", "free some space on the disk"
     INSTALL_EXTRA = "install-extra", "install the missing packages", "pip install 'hbr-rig[{extra}]'"

@@ -1,4 +1,4 @@
-"""Show and change the configuration."""
+"""Show, check and change the configuration."""
 
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
@@ -20,8 +20,23 @@ from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError
 from rig.core.masking import masked
 from rig.core.next_steps import Do
+from rig.core.phrases import counted
 
 app = Group(__doc__)
+
+
+@app.command("check")
+def check(settings: Settings) -> None:
+    """Check the whole configuration and list all mistakes. Exit code 3 if there is one.
+
+    Example: rig config check --config rig.toml
+    """
+    values = read_values(settings.config, settings.overrides)
+    config, _ = check_config(values)
+    given = sum(values.origin(info.key) != "default" for info in key_info(type(config)))
+    where = str(values.path) if values.path else "No file: every key has its default"
+    text = f"{where}: no mistakes, {counted(given, 'key')} given."
+    settings.say(text, {"path": values.path, "valid": True, "keys_given": given})
 
 
 @app.command("show")
@@ -32,8 +47,6 @@ def show(
     ] = None,
 ) -> None:
     """Show every key as TOML: its value, where the value comes from, and a description.
-
-    If the configuration has mistakes, they are all listed instead, and the exit code is 3.
 
     A value comes from the defaults, a calibration, the file, or --set; each of them overrides those before it. The
     bench is not opened: a calibration counts here if it belongs to its present devices (rig calibrate show).

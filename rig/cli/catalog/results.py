@@ -38,12 +38,13 @@ class Filters(TypedDict):
 
 @app.command("list")
 def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
-    """List results, oldest first. Filters use the corrected values, and so do the columns.
+    """List results, oldest first. Filters use the corrected values, and so do the columns; the last one counts them.
 
     Example: rig results list --sample S-0042 --since 7d --bench sim
     """
     rows = [result.as_row().model_dump() for result in _find(settings, filters)]
-    _show_rows(settings, rows, ("result", "time_utc", "operator", "sample", "outcome", "object", "views", "bench"))
+    columns = ("result", "time_utc", "operator", "sample", "outcome", "object", "views", "bench", "corrections")
+    _show_rows(settings, rows, columns)
 
 
 @app.command("show")

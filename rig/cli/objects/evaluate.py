@@ -48,6 +48,10 @@ def evaluate(
     descriptor: Annotated[
         str | None, typer.Option(metavar="NAME", help="Descriptor of the views: cedd, edges+colours+cedd, ...")
     ] = None,
+    orientation_errors: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Errors of the orientation: a result imu.rotation of rig calibrate imu."),
+    ] = None,
     jobs: JobsOption = None,
     out: Annotated[
         Path | None,
@@ -68,6 +72,7 @@ def evaluate(
             noise=noise,
             methods=methods,
             descriptor=None if descriptor is None else known_descriptor(descriptor).name,
+            orientation_errors=orientation_errors,
             seed=settings.seed,
         )
         asked = replace(asked, margin=rule.margin, min_views=rule.min_views)

@@ -51,6 +51,10 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
                 except RigError as error:
                     show_error(error, settings)
                     raise typer.Exit(error.exit_code) from None
+                except RuntimeError as error:  # Python 3.11 makes it of a signal in __set_name__, as in many imports
+                    if isinstance(error.__cause__, KeyboardInterrupt | SystemExit):
+                        raise error.__cause__ from None
+                    raise
         except BrokenPipeError:  # the reader of a pipe, such as head, has ended
             discard(sys.stdout)
             raise typer.Exit(EXIT_BY_SIGNAL + signal.SIGPIPE) from None

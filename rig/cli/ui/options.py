@@ -30,6 +30,7 @@ class CommonOptions(TypedDict):
     ]
     seed: Annotated[int | None, typer.Option(min=0, metavar="N", help="Seed of the simulated bench.")]
     json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout and text on stderr.")]
+    no_color: Annotated[bool, typer.Option("--no-color", help="Print without colours, as with NO_COLOR=1.")]
 
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]

@@ -4,6 +4,7 @@ This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must 
 """
 
 import json
+import os
 import sys
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -40,8 +41,10 @@ class Settings:
     opened: list[str] = field(default_factory=list, repr=False, compare=False)
     """Benches that the command has opened."""
 
-    def merged(self, *, overrides: list[str] | None = None, **given: Any) -> "Settings":
+    def merged(self, *, overrides: list[str] | None = None, no_color: bool = False, **given: Any) -> "Settings":
         """Return these settings, replaced by those of `CommonOptions` that follow the command."""
+        if no_color:
+            os.environ["NO_COLOR"] = "1"  # also for the programs that this one starts
         changed = {name: value for name, value in given.items() if value is not None and value is not False}
         return replace(self, overrides=(*self.overrides, *(overrides or ())), **changed)
 

@@ -58,6 +58,15 @@ def test_help_imports_no_heavy_module():
     assert "HEAVY []" in done.stdout
 
 
+@pytest.mark.parametrize("arguments", ["--no-color enroll --help", "config show servo --no-color"])
+def test_no_color_works_at_any_position(arguments):
+    environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm-256color", "COLUMNS": "90"}
+    environment.pop("NO_COLOR", None)
+    done = subprocess.run([*RIG, *arguments.split()], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "\x1b[3" not in done.stdout + done.stderr  # no colour; bold and dim are allowed
+
+
 @pytest.mark.nightly
 def test_terminal_without_unicode_shows_question_marks(tmp_path):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}

@@ -63,6 +63,14 @@ def new():
     finally:
         print("closed")
 """
+SET_NAME = """
+@command
+def new(settings):
+    class Part:
+        def __set_name__(self, owner, name): interrupt()
+    class Whole:
+        part = Part()
+"""
 DEL = """
 @command
 def new(settings):
@@ -77,6 +85,7 @@ def new(settings):
     ("command", "output", "errors"),
     [
         pytest.param(PLAIN, "closed\n", "", id="command-of-a-package"),
+        pytest.param(SET_NAME, "", "Interrupted.\n", id="python-3.11-makes-another-exception-of-it"),
         pytest.param(DEL, "", "Interrupted.\n", id="python-drops-the-exception"),
     ],
 )

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceSilent
 from rig.devices.bno055 import Bno055
+from rig.motion.turntable import Turntable
 from sim.imu.bno055 import SILENT_S, SimBno055
 from sim.motion import to_position
 from sim.noise import NoiseModel
@@ -164,3 +165,15 @@ def test_rare_corrupt_readings_are_repeated_and_counted(bench: ImuBench, imu: Bn
         rotated += float(imu.read_samples().gyro_dps[:, 2].sum()) / imu.rate_hz
     assert rotated == pytest.approx(30.0 * (bench.clock.now_ns() - begun_ns) * 1e-9, abs=2.0)
     assert imu.statistics.corrupt > 3
+
+
+def test_bench_works_with_a_bus_at_10_khz(simulated) -> None:
+    s = simulated("imu.model=bno055")
+    bus = s.operator.devices.i2c
+    bus.bit_ns, bus.stretch_errors = 100_000, 1.0  # at this low speed, a stretch ends within its bit
+    with Turntable(s.bench) as table:
+        for angle_deg in (90.0, 45.0):
+            move = table.goto(angle_deg)
+            assert move.agrees
+            assert move.gyro.valid
+    assert s.bench.imu.statistics.corrupt == 0

@@ -31,7 +31,7 @@ from sim.clock import VirtualClock
 from sim.head.serial_port import HeadSerial
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
-from tests.contract.heads import AVR_NIGHTLY, mpu6050, simulated_head, switch_on
+from tests.contract.heads import AVR_NIGHTLY, mpu6050, opened_head, simulated_head, switch_on
 from tests.rig.devices.scripted_serial import ScriptedSerial
 
 MS = 1_000_000
@@ -152,6 +152,17 @@ def test_silent_computer_switches_outputs_off(opened):
     assert not opened.head.relay_closed  # the head never closes the relay by itself
     opened.imu.set_power(True)
     assert opened.head.relay_closed
+
+
+@pytest.mark.parametrize("deadman_s", [0.25, pytest.param(2.0, marks=pytest.mark.nightly)])
+def test_deadman_has_the_configured_duration(deadman_s):
+    with opened_head(noise=NoiseModel.none(), deadman_s=deadman_s) as h:
+        h.imu.set_power(True)
+        h.imu._cancel()
+        last_ns = h.imu._heartbeat_ns
+        h.clock.sleep(3.0)
+        silent_s = (h.head.pulses("relay")[-1][0] - last_ns) * 1e-9
+        assert deadman_s * 0.99 - 0.002 <= silent_s <= deadman_s * 1.01 + 0.001
 
 
 def test_estop_acts_within_a_millisecond_without_the_computer(opened):

@@ -7,6 +7,7 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
+from pathlib import Path
 
 import dynamixel_sdk.port_handler
 import numpy as np
@@ -16,6 +17,7 @@ from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+import rig.devices
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound, DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
@@ -185,6 +187,15 @@ def test_waiting_uses_no_cpu() -> None:
     os.close(far)
     assert wall_s > 0.1
     assert cpu_s < 0.35 * wall_s
+
+
+def test_defective_sdk_functions_are_not_called() -> None:
+    """`broadcastPing` waits 0.8 s at 1 MBd and 1.4 s at 57,600 for any answers (only a scan may take this long);
+    `fastSyncRead` raises IndexError.
+    """
+    sources = [path.read_text(encoding="utf-8") for path in Path(rig.devices.__file__).parent.rglob("*.py")]
+    assert len(sources) > 15
+    assert not [text for text in sources if ".broadcastPing(" in text or "fastSyncRead" in text]
 
 
 # -- the port ----------------------------------------------------------------------------------------------------------

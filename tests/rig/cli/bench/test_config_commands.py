@@ -26,13 +26,13 @@ def rig(rig, tmp_path, monkeypatch):
     return rig
 
 
-def test_show_lists_all_mistakes(rig, tmp_path):
+def test_check_lists_all_mistakes(rig, tmp_path):
     (tmp_path / "rig.toml").write_text(
         "[bench.sim]\nobjekt = 1\n[bench.sin]\nx = 1\n[imu]\nbus = [1]\nrange_dps = 300\n"
         '[table]\nlimits_deg = ["a", 3]\n[camera]\nexposure_us = -1\nheigth = 3\n',
         encoding="utf-8",
     )
-    done = rig("config", "show", "--set", "identify.margin=-1", "--set", "servo.id=none")
+    done = rig("config", "check", "--set", "identify.margin=-1", "--set", "servo.id=none")
     assert done.exit_code == 3
     for line in (
         "bench.sim.objekt: unknown key; did you mean object?",
@@ -59,9 +59,11 @@ def test_show_lists_all_mistakes(rig, tmp_path):
 )
 def test_mistake_is_explained(rig, tmp_path, text, words):
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
-    done = rig("config", "show")
+    done = rig("config", "check")
     assert done.exit_code == 3
     assert words in done.stderr
+    (tmp_path / "rig.toml").write_text("[servo]\nid = 4\n", encoding="utf-8")
+    assert rig("config", "check").stdout == "rig.toml: no mistakes, 1 key given.\n"
 
 
 def test_comments_of_a_new_file_hold_the_defaults(tmp_path):

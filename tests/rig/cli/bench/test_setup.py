@@ -121,7 +121,7 @@ def test_doctor_uses_the_defaults_if_the_configuration_is_broken(home):
     assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo]\nbaud = 3\nprot = 1\n"
     done = rig("doctor", "--bench", "sim")
     assert done.exit_code == 3
-    assert done.stdout.count("→ Check the configuration: `rig config show`.") == 2
+    assert done.stdout.count("→ Check the configuration: `rig config check`.") == 2
     assert "XL430-W250" in done.stdout
 
 

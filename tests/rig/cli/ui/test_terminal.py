@@ -101,6 +101,12 @@ def test_mistaken_arguments_are_neutral_and_with_json_an_object():
     assert CliRunner().invoke(app, ["catalog", "show", "--nix"]).stdout == ""
 
 
+def test_every_console_guards_its_text():
+    sources = [path for room in ("rig", "sim", "calibration") for path in Path(room).rglob("*.py")]
+    assert sources
+    assert [path for path in sources if re.search(r"\bConsole\(", path.read_text(encoding="utf-8"))] == []
+
+
 @pytest.mark.parametrize(
     "arguments",
     ["config show", *(pytest.param(words, marks=pytest.mark.nightly) for words in ("--help", "nix --json"))],
