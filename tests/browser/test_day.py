@@ -160,10 +160,6 @@ def test_first_contact_leads_from_an_empty_table_to_an_answer(page, serve_proces
     page.wait_for_selector("rig-shelf :text('The table is empty')")
     page.click("#go:not([disabled])")
     page.wait_for_selector("#answer:has-text('No object on the table')")
-    page.goto(server.url)
-    page.click("rig-shelf button:has-text('Unplug the camera')")
-    page.wait_for_selector("#live.stale")
-    page.wait_for_selector("#live:not(.stale)")  # it is plugged in again
 
 
 def test_stop_button_above_an_open_dialog_stops_the_table(page, serve_process):
