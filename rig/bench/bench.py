@@ -351,7 +351,7 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
         except ConfigError as error:
             found += error.evidence.get("mistakes") or [f"bench.{name}: {error.what} {error.next_step}"]
     if found:
-        raise config_mistakes(found, where)
+        raise config_mistakes(found, where, read.lines)
     return config, options
 
 

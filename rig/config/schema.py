@@ -566,8 +566,8 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = (), *, sear
     Without ``path`` it is the file in force, if any; with ``search`` false there is no file.
 
     Raises `ConfigError`: the file is missing, is not TOML, or has mistakes; the evidence lists all of them with their
-    keys.
+    lines and keys.
     """
     read = read_values(path, overrides, search=search)
     where = str(read.path) if read.path else "the command line"
-    return validate(RigConfig, read.values, where=where)
+    return validate(RigConfig, read.values, where=where, lines=read.lines)

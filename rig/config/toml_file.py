@@ -2,7 +2,7 @@
 
 An edit replaces or inserts one line ``key = value`` below the header of its table. `tomllib` reads the result, and an
 edit that changed anything else is rejected: values of several lines, inline tables and dotted keys are for people.
-tomlkit is not used, because it does not put a new key below its commented default.
+tomlkit is not used, because it does not put a new key below its commented default, and reports no line numbers.
 """
 
 import difflib
@@ -59,6 +59,19 @@ def loads(text: str) -> dict[str, Any]:
     if inside:
         raise ValueError(f"tables or lists are nested more than {MAX_DEPTH} deep")
     return values
+
+
+def line_numbers(text: str) -> dict[Key, int]:
+    """Return the line of each key and table, for messages. A text of several lines may hold what looks like one."""
+    found: dict[Key, int] = {}
+    table: Key = ()
+    for number, line in enumerate(StringIO(text), 1):
+        if header := _HEADER.fullmatch(line.rstrip()):
+            table = _parts(header[1])
+            found.setdefault(table, number)
+        elif assigned := _ASSIGNED.match(line):
+            found.setdefault((*table, *_parts(assigned[1])), number)
+    return found
 
 
 def with_values(text: str, changes: Mapping[Key, Any]) -> str:

@@ -1,16 +1,17 @@
-"""Reads a configuration file and the settings of the command line, and checks them; reports all mistakes."""
+"""Reads a configuration file and the settings of the command line, and checks them; reports all mistakes with lines."""
 
 import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import platformdirs
 from pydantic import BaseModel, ValidationError
 
-from rig.config.toml_file import MAX_DEPTH, NONE, Key, loads, read_text
+from rig.config.toml_file import MAX_DEPTH, NONE, Key, line_numbers, loads, read_text
 from rig.config.wording import mistakes
 from rig.core.errors import ConfigError
 from rig.core.next_steps import Do
@@ -37,21 +38,28 @@ def search_paths() -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class Values:
-    """Unchecked values of a file and the command line; ``overridden`` are the keys that the command line gives."""
+    """Unchecked values of a file and the command line.
+
+    ``overridden`` are the keys that the command line gives, ``lines`` the lines of the others in the file, by name.
+    """
 
     path: Path | None
     values: dict[str, Any]
     overridden: frozenset[Key]
+    lines: dict[str, int]
 
     def origin(self, key: Key) -> str:
-        """Return where a key's value comes from: ``rig.toml``, ``--set``, or ``default``."""
+        """Return where a key's value comes from: ``rig.toml line 3``, ``--set``, or ``default``."""
         here: Any = self.values
         for part in key:
             if not isinstance(here, Mapping) or part not in here:
                 return "default"
             here = here[part]
         is_overridden = any(key[:n] in self.overridden for n in range(1, len(key) + 1))
-        return "--set" if is_overridden or self.path is None else self.path.name
+        if is_overridden or self.path is None:
+            return "--set"
+        line = self.lines.get(".".join(key))
+        return f"{self.path.name} line {line}" if line else self.path.name
 
 
 def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, search: bool = True) -> Values:
@@ -62,11 +70,12 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, sear
     Raises `ConfigError`: the file is missing or is not TOML, or an override is invalid.
     """
     values: dict[str, Any] = {}
+    lines: dict[Key, int] = {}
     source = path or (default_path() if search else None)
     if source is not None:
         text = read_text(source)
         try:
-            values = loads(text)
+            values, lines = loads(text), line_numbers(text)
         except ValueError as error:
             raise ConfigError(
                 f"{source} is not a TOML file.",
@@ -75,28 +84,38 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, sear
             ) from error
         for key in _PATHS:
             _resolve(values, key, source.resolve().parent)
-    return Values(source, values, frozenset([_apply(values, override) for override in overrides]))
+    overridden = frozenset([_apply(values, override) for override in overrides])
+    named = {".".join(key): line for key, line in lines.items() if key not in overridden}
+    return Values(source, values, overridden, named)
 
 
-def validate(model: type[M], values: Mapping[str, Any], *, where: str, prefix: str = "") -> M:
+def validate(
+    model: type[M],
+    values: Mapping[str, Any],
+    *,
+    where: str,
+    prefix: str = "",
+    lines: Mapping[str, int] = MappingProxyType({}),
+) -> M:
     """Return ``values`` as ``model``; raises one `ConfigError` with all mistakes.
 
-    ``prefix`` is the model's path in the configuration.
+    ``prefix`` is the model's path in the configuration, and ``lines`` are as those of `Values`.
     """
     try:
         return model.model_validate(values)
     except ValidationError as error:
         above = tuple(prefix.split(".")) if prefix else ()
         found = mistakes(model, values, error.errors(include_url=False), above)
-    raise config_mistakes(found, where)
+    raise config_mistakes(found, where, lines)
 
 
-def config_mistakes(found: list[str], where: str) -> ConfigError:
-    """Return the error for a configuration with mistakes."""
+def config_mistakes(found: list[str], where: str, lines: Mapping[str, int]) -> ConfigError:
+    """Return the error for a configuration with mistakes, each with its line if that is known."""
+    placed = {one: lines.get(one.partition(":")[0]) for one in found}
     return ConfigError(
         f"{len(found)} mistake{'s' if len(found) > 1 else ''} in {where}.",
         next_step=("Fix the listed keys.", Do.CHECK_CONFIGURATION()),
-        evidence={"mistakes": found},
+        evidence={"mistakes": [f"line {line}: {one}" if line else one for one, line in placed.items()]},
     )
 
 

@@ -18,6 +18,7 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.packets import PING, READ, WRITE, Packets, Reply
 from rig.devices.dynamixel.port import READ_SLICE_S, BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import ControlTable, control_table
+from rig.devices.head.link import Deframer, HeadStatistics
 from rig.devices.i2c import I2cBus
 from rig.devices.imu import open_imu
 from rig.devices.opencv_camera import OpenCvCamera
@@ -33,7 +34,7 @@ _TOLERANCES: Final = {
 _ANGLES: Final = ("Present Position", "Position Trajectory")
 _RATES: Final = ("Present Velocity", "Velocity Trajectory")
 _SWITCHING: Final = ("Moving", "Moving Status")
-"""Registers that are not compared: they change at a moment, which may be one reading earlier or later."""
+"""Registers that change at a moment: one reading earlier or later is no difference."""
 _OF_THE_BUS: Final = ("ID", "Baud Rate", "Secondary ID", "Protocol Type")
 _ONLY_WRITTEN: Final = ("Goal", "Profile", "Bus Watchdog", "LED", "Moving Speed", "Torque", "Realtime Tick")
 """Beginnings of the registers that depend on what happened before the trace, until they are written."""
@@ -86,6 +87,11 @@ def replay_drivers(trace: Trace) -> Replay:
             now = imu_notes(imu, clock)
         for name in now or notes:
             result.compare(f"imu {name}", clock.now_ns(), notes.get(name), now.get(name))
+    # Of a rig head, the frames: a corrupt one is a difference.
+    deframer = Deframer(statistics := HeadStatistics())
+    for event in trace.of("head"):
+        before, _ = statistics.crc_errors + statistics.malformed, list(deframer.feed(event.read or b""))
+        result.compare("head corrupt frames", event.t_ns, before, statistics.crc_errors + statistics.malformed)
     return result
 
 
@@ -163,6 +169,7 @@ class _Servo:
         self._table = control_table(config.servo.model, self._first(requests).get("Firmware Version"))
         self._initial = self._first(requests)
         self._written: set[int] = set()
+        self._last: dict[str, tuple[int, int]] = {}
         row = self._table.row
         self._tolerances = _TOLERANCES | dict.fromkeys(_ANGLES, max(_ANGLE_DEG / row.deg_per_count, 1.0))
         self._tolerances |= dict.fromkeys(_RATES, max(_RATE_DPS / row.dps_per_unit, 1.0))
@@ -194,10 +201,13 @@ class _Servo:
         result.compare("servo error", t_ns, (recorded.error, recorded.alert), (reply.error, reply.alert))
         values = self._values(request, reply)
         for name, before in self._values(request, recorded).items():
-            unknown = name.startswith(_ONLY_WRITTEN) and self._table[name].address not in self._written
-            if not unknown and name not in _SWITCHING:
-                tolerance = self._tolerances.get(name, 0.0) if name in values else 0.0
-                result.compare(f"servo {name}", t_ns, before, values.get(name), tolerance)
+            if name.startswith(_ONLY_WRITTEN) and self._table[name].address not in self._written:
+                continue
+            now = values.get(name)
+            if now is not None and name in _SWITCHING:
+                last, self._last[name] = self._last.get(name, (before, now)), (before, now)
+                now = before if now == last[0] or before == last[1] else now
+            result.compare(f"servo {name}", t_ns, before, now, 0.0 if now is None else self._tolerances.get(name, 0.0))
 
     def _first(self, requests: list[_Request]) -> dict[str, int]:
         answered = [(request, request.reply) for request in requests if request.reply is not None]

@@ -30,10 +30,10 @@ def test_all_mistakes_are_reported_with_range_and_suggestion(tmp_path):
         load_config(file)
     mistakes = "\n".join(caught.value.evidence["mistakes"])
     assert len(caught.value.evidence["mistakes"]) == 7
-    assert "servo.baud: must be a whole number from 9600 to 4500000 bit/s (found 3)" in mistakes
-    assert "servo.prot: unknown key; did you mean port?" in mistakes
+    assert "line 2: servo.baud: must be a whole number from 9600 to 4500000 bit/s (found 3)" in mistakes
+    assert "line 3: servo.prot: unknown key; did you mean port?" in mistakes
     assert "table.limits_deg: must span at least one revolution" in mistakes
-    assert "table.velocity_dps: must be a number from 0.1 to 200 °/s (found -1)" in mistakes
+    assert "line 6: table.velocity_dps: must be a number from 0.1 to 200 °/s (found -1)" in mistakes
     assert "identify.min_views: must not be above max_views, which is 1 (found 2)" in mistakes
     assert "view: roi [80, 0, 480, 480] is not within the camera's frame of 320x480" in mistakes
     assert "identify.max_view: unknown key; did you mean max_views?" in mistakes

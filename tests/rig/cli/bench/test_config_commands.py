@@ -35,13 +35,13 @@ def test_check_lists_all_mistakes(rig, tmp_path):
     done = rig("config", "check", "--set", "identify.margin=-1", "--set", "servo.id=none")
     assert done.exit_code == 3
     for line in (
-        "bench.sim.objekt: unknown key; did you mean object?",
-        "bench.sin: There is no bench 'sin'. Did you mean sim?",
-        'imu.bus: must be a whole number or a text in "quotes" (found [1])',
+        "line 2: bench.sim.objekt: unknown key; did you mean object?",
+        "line 3: bench.sin: There is no bench 'sin'. Did you mean sim?",
+        'line 6: imu.bus: must be a whole number or a text in "quotes" (found [1])',
         "imu.range_dps: must be one of 250, 500, 1000, 2000 °/s (found 300)",
         "table.limits_deg: must be [a number, a number] ° (found ['a', 3])",
         "camera.exposure_us: must be a number from 1 to 1000000 µs, or none (found -1)",
-        "camera.heigth: unknown key; did you mean height?",
+        "line 12: camera.heigth: unknown key; did you mean height?",
         "identify.margin: must be a number from 0 to 1 (found -1)",
         "servo.id: must be a whole number from 0 to 252 (found 'none')",
     ):
@@ -83,7 +83,7 @@ def test_show_prints_toml_with_the_source_of_each_value(rig, tmp_path):
     assert (shown["servo"]["id"], shown["servo"]["baud"], shown["bench"]["sim"]["object"]) == (4, 115200, "dice")
     reported = json.loads(rig("config", "show", "servo", "--set", "servo.baud=115200", "--json").stdout)["keys"]
     origins = [reported[key]["origin"] for key in ("servo.id", "servo.baud", "servo.port")]
-    assert origins == ["rig.toml", "--set", "default"]
+    assert origins == ["rig.toml line 2", "--set", "default"]
     assert reported["servo.baud"]["unit"] == "bit/s"
     assert "table.zero_deg" not in reported
     assert "Did you mean servo.port?" in rig("config", "show", "servo.prot").stderr

@@ -132,3 +132,14 @@ def test_a_missing_imu_does_not_end_the_recording(rig: Rig):
     assert "The trace has no imu." in done.output
     assert "The trace has no camera." in done.output
     assert rig("servo", "replay", "servo.jsonl").exit_code == 0
+
+
+def test_corrupt_frame_of_a_rig_head_is_noticed(rig: Rig):
+    assert rig("servo", "record", "head.jsonl", "--still", "--set", "imu.connection=head").exit_code == 0
+    assert rig("servo", "replay", "head.jsonl").exit_code == 0
+    lines = [json.loads(line) for line in Path("head.jsonl").read_text().splitlines()]
+    longest = max((line for line in lines if line.get("on") == "head"), key=lambda line: len(line.get("read") or ""))
+    longest["read"] = longest["read"][:20] + "01" * 4 + longest["read"][28:]
+    Path("head.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    (found,) = differing(rig("servo", "replay", "head.jsonl", "--json"))
+    assert found.startswith("driver: head corrupt frames at ")
