@@ -87,7 +87,7 @@ ARGUMENTS = st.one_of(
     st.sampled_from(EVIL), st.text(max_size=12).filter(lambda text: "\0" not in text), st.integers().map(str)
 )
 COMMANDS = [
-    *("config show", "config set", "catalog list", "catalog show", "catalog rename"),
+    *("config show", "config set", "config check", "catalog list", "catalog show", "catalog rename"),
     *("catalog label", "catalog delete", "catalog verify", "catalog gc", "log", "status", "goto"),
     *("home", "stop", "acknowledge", "replay", "report", "export", "import", "servo", "eval"),
 ]

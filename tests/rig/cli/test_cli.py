@@ -115,11 +115,11 @@ def test_support_bundle_has_no_passwords_and_tokens(rig):
 @pytest.mark.parametrize(
     "words",
     [
-        *("config show", "config show catalog.url --json", "config set camera.source 7", "log"),
+        *("config show", "config show catalog.url --json", "config set camera.source 7", "config check", "log"),
         *("doctor", "doctor --json", "status --json", "catalog list", "catalog list --json", "identify", "enroll mug"),
         "catalog list --set catalog.url=postgresql://ada:w0rd@host.invalid:port/rig",
         "config show catalog --set catalog.url=postgresql://ada:w0rd@host.invalid/rig",
-        "config show --set servo.baud=a://b:w0rd@c",
+        "config check --set servo.baud=a://b:w0rd@c",
         "config set catalog.url postgresql://ada:w0rd@other.invalid/rig",
         "config set catalog.images s3://ada:w0rd@bucket",
         "config set catalog.password w0rd",

@@ -42,7 +42,17 @@ def interrupted(folder: Path, moment: str, *words: str) -> subprocess.CompletedP
     )
 
 
-@pytest.mark.parametrize(("moment", "words"), [("rig.cli.main", "--version"), ("rig.bench", "goto 90 --bench sim")])
+@pytest.mark.parametrize(
+    ("moment", "words"),
+    [
+        ("rig.cli.main", "--version"),
+        ("rig.bench", "goto 90 --bench sim"),  # the command has begun
+        *(
+            pytest.param(moment, "goto 90 --bench sim", marks=pytest.mark.nightly)
+            for moment in ("typer", "rig.core.signals", "rig.cli.bench.table", "numpy", "cv2")
+        ),
+    ],
+)
 def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words, tmp_path):
     done = interrupted(tmp_path, moment, *words.split())
     assert done.returncode == 130
