@@ -7,7 +7,7 @@ from contextlib import aclosing
 from importlib.metadata import version
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import Body, Header, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import Header, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import HTMLResponse, StreamingResponse
 from pydantic import AwareDatetime, BaseModel, Field
 
@@ -24,9 +24,7 @@ from rig.web.hub import MAX_LISTENERS
 from rig.web.requests import GotoRequest, Job, JobRequest, JobState, RequestBody
 from rig.web.server import API, COOKIE, Manager, OperatorPerson, Page, Proposer, Routes, Server, Watcher, long_work
 
-Force = Annotated[bool, Body(embed=True, description="take it over from another operator, who is warned")]
 IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=200, description="names the request")]
-Words = Annotated[list[Annotated[str, Field(max_length=100)]], Body(embed=True, min_length=1, max_length=4)]
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
     201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
 }
@@ -87,6 +85,18 @@ class Me(Login):
     lease: LeaseState
 
 
+class LoginBody(RequestBody):
+    """A token."""
+
+    token: Annotated[str, Field(max_length=200)]
+
+
+class LeaseBody(RequestBody):
+    """How to take the lease."""
+
+    force: bool = Field(False, description="take it over from another operator, who is warned")
+
+
 class TokenBody(RequestBody):
     """A token to be made."""
 
@@ -102,9 +112,9 @@ def add_access(routes: Routes, server: Server) -> None:
         return Health(version=version("hbr-rig"), bench_open=bool(server.status.get("open")))
 
     @routes.public.post("/login", tags=["access"])
-    def login(token: Annotated[str, Body(embed=True, max_length=200)], response: Response) -> Login:
+    def login(body: LoginBody, response: Response) -> Login:
         """Log in with a token; the answer sets a cookie."""
-        secret, person = server.sessions.login(token)
+        secret, person = server.sessions.login(body.token)
         secure = server.setup.certfile is not None
         response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=secure, path="/")
         return Login(name=person.name, role=person.role)
@@ -124,9 +134,9 @@ def add_access(routes: Routes, server: Server) -> None:
         return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
 
     @routes.manage.post("/lease", tags=["access"], response_model=LeaseState)
-    def take_lease(person: Manager, force: Force = False) -> Any:
+    def take_lease(body: LeaseBody, person: Manager) -> Any:
         """Take or renew the lease."""
-        server.lease.take(person, force=force)
+        server.lease.take(person, force=body.force)
         return server.lease.as_json()
 
     @routes.watch.delete("/lease", tags=["access"], response_model=LeaseState)
@@ -387,6 +397,12 @@ def add_jobs(routes: Routes, server: Server) -> None:
         return Response(content, media_type="application/json", headers={"Cache-Control": "no-store"})
 
 
+class ByHand(RequestBody):
+    """What hands do at a simulated bench: ``put NAME``, ``clear``, ``light 0.5`` or ``unplug`` the camera."""
+
+    words: Annotated[list[Annotated[str, Field(max_length=100)]], Field(min_length=1, max_length=4)]
+
+
 class ShelfState(BaseModel):
     """A simulated bench: the ``things`` on its shelf, the ``object`` on the table, its light and its faults."""
 
@@ -405,12 +421,9 @@ def add_shelf(routes: Routes, server: Server) -> None:
         return server.bench.call("shelf")
 
     @routes.operate.post("/shelf", tags=["bench"], response_model=ShelfState)
-    def use_shelf(words: Words) -> Any:
-        """Do something by hand at a simulated bench; the event `shelf` says what was done.
-
-        The words are `put NAME`, `clear`, or `light 0.5`.
-        """
-        return server.bench.call("by_hand", words=words)
+    def use_shelf(body: ByHand) -> Any:
+        """Do something by hand at a simulated bench; the event `shelf` says what was done."""
+        return server.bench.call("by_hand", words=body.words)
 
     @routes.watch.get("/shelf/{name}", tags=["bench"], response_class=Jpeg)
     def get_thing(name: str) -> Jpeg:

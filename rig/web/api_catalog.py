@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 from anyio import open_file, to_thread
-from fastapi import Body, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 from starlette.background import BackgroundTask
@@ -87,6 +87,12 @@ class ObjectBody(RequestBody):
     note: Annotated[str | None, Field(max_length=10_000)] = None
 
 
+class NameBody(RequestBody):
+    """The name of an object."""
+
+    name: Annotated[str, Field(max_length=1000)]
+
+
 def add_objects(routes: Routes, server: Server) -> None:
     @routes.watch.get("/objects", tags=["catalog"], response_model=ListOf[ListedObject])
     def list_objects(
@@ -147,13 +153,11 @@ def add_objects(routes: Routes, server: Server) -> None:
         return Deleted(deleted=name)
 
     @routes.operate.post("/undelete", tags=["catalog"])
-    def restore_object(
-        name: Annotated[str, Body(embed=True, max_length=1000)], person: OperatorPerson
-    ) -> ObjectSummary:
+    def restore_object(body: NameBody, person: OperatorPerson) -> ObjectSummary:
         """Restore a deleted object."""
         with server.catalog.open_to_change(person) as catalog:
-            catalog.undelete(name)
-            return catalog.summary(name)
+            catalog.undelete(body.name)
+            return catalog.summary(body.name)
 
 
 def sent_image(

@@ -3,7 +3,7 @@
 import re
 from typing import Annotated, Any, Final
 
-from fastapi import Body, Response
+from fastapi import Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import AwareDatetime, BaseModel, Field
 
@@ -21,6 +21,7 @@ from rig.core.next_steps import Do
 from rig.events.events import DESCRIBED, JsonEvent, event_dict
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.answers import ListOf
+from rig.web.requests import RequestBody
 from rig.web.server import Page, Routes, Server, long_work
 from rig.web.work import calibrations
 
@@ -113,7 +114,10 @@ class Settings(BaseModel):
     file: str | None
 
 
-NewValue = Annotated[bool | int | float | str | list[float] | None, Body(embed=True)]
+class SettingBody(RequestBody):
+    """A new value of a key of the configuration; null clears a key that can be without one."""
+
+    value: bool | int | float | str | list[float] | None
 
 
 def add_records(routes: Routes, server: Server) -> None:
@@ -182,8 +186,8 @@ def add_records(routes: Routes, server: Server) -> None:
         return Settings(keys=keys, file=None if file is None else str(file))
 
     @routes.operate.put("/settings/{key}", tags=["bench"])
-    def change_setting(key: Annotated[str, Field(max_length=60)], value: NewValue) -> list[str]:
-        """Write a key into the configuration file; it is in force when the server starts again. Null clears a key.
+    def change_setting(key: Annotated[str, Field(max_length=60)], body: SettingBody) -> list[str]:
+        """Write a key into the configuration file; it is in force when the server starts again.
 
         The answer has the lines of the file that were changed: removed ones with `-`, added ones with `+`.
         """
@@ -194,7 +198,7 @@ def add_records(routes: Routes, server: Server) -> None:
                 next_step=("At a terminal of the bench's computer:", Do.SET_KEY(key=key, value="VALUE")),
             )
         try:
-            return set_key(file, key, NONE if value is None else toml(value))
+            return set_key(file, key, NONE if body.value is None else toml(body.value))
         except ConfigError as error:  # of this request, not of the server
             raise UsageError(error.what, next_step=error.steps, evidence=error.evidence) from error
 

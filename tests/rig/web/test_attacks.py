@@ -126,6 +126,21 @@ def test_impossible_requests_are_rejected_with_their_mistakes(served, body):
     assert answer.json()["evidence"]["mistakes"]
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("POST", "login", {"token": "t"}),
+        ("POST", "lease", {"force": True}),
+        ("POST", "undelete", {"name": "lamp"}),
+        ("POST", "shelf", {"words": ["clear"]}),
+        ("PUT", "settings/identify.max_views", {"value": 5}),
+    ],
+)
+def test_unknown_key_of_a_request_is_a_mistake(served, method, path, body):
+    answer = served.client.request(method, f"{API}/{path}", json=body | {"extra": 1})
+    assert (answer.status_code, "extra" in answer.text) == (422, True)
+
+
 def test_error_of_a_job_names_the_next_step_and_the_server_continues(serve):
     served = serve()
     error = served.run(kind="identify")["error"]
