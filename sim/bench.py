@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,6 +34,7 @@ from sim.optics import Optics
 from sim.world import SimObject, World
 
 _NO_FILES: Final = Path("/nonexistent")
+_UNPLUGGED_S: Final = 8.0  # long enough to see what the pages say
 _SHOWN_DEG: Final = 25.0  # most objects show their handle and their picture from there
 
 
@@ -173,8 +175,9 @@ class ShelfOperator:
 class SimShelf:
     """The shelf of a simulated bench: a person at a page puts its objects on the table, and changes the bench."""
 
-    def __init__(self, operator: ShelfOperator) -> None:
+    def __init__(self, operator: ShelfOperator, unplug: Callable[[], None]) -> None:
         self._operator = operator
+        self._unplug = unplug
 
     @property
     def things(self) -> list[str]:
@@ -195,7 +198,7 @@ class SimShelf:
         }
 
     def do(self, words: Sequence[str]) -> None:
-        """Put an object on the table in any orientation, clear the table, or set the light.
+        """Put an object on the table in any orientation, clear the table, set the light, or unplug the camera a while.
 
         Raises `UsageError`, `ObjectNotFound`: there is no such thing to do, or no such object.
         """
@@ -208,8 +211,10 @@ class SimShelf:
                 operator.world.put(None)
             case ["light", ("0.25" | "0.5" | "1" | "1.5") as factor]:
                 operator.world.change(light=(float(factor),) * 3)
+            case ["unplug"]:
+                self._unplug()
             case _:
-                raise UsageError("Hands cannot do that.", next_step="put NAME, clear, or light 0.5.")
+                raise UsageError("Hands cannot do that.", next_step="put NAME, clear, light 0.5, or unplug.")
 
 
 def open_sim_bench(
@@ -269,6 +274,8 @@ class SimBenchKind(BenchKind):
 
     name = "sim"
     options: type[BaseModel] = SimOptions
+    _camera_back_ns = 0
+    """When the camera is plugged in again, on the computer's clock: a bench that is opened before has none either."""
 
     def prepare(self, config: RigConfig, options: Any, world: World) -> tuple[RigConfig, ShelfOperator]:  # noqa: ARG002
         """Return the bench's configuration, and the operator with what is on the bench."""
@@ -285,13 +292,23 @@ class SimBenchKind(BenchKind):
                 operator.place(HOME_MARK)
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
-            faults = map(Fault.parse, options.faults)
+            faults = [*map(Fault.parse, options.faults), *self._unplugged(options)]
             bench = open_sim_bench(config, operator, faults=faults, open_now=(), name=self.name)
             bench.findings += operator.findings
             if options.object is None:
-                bench.shelf = SimShelf(operator)
+                bench.shelf = SimShelf(operator, partial(self._unplug, operator, options))
             bench.connections.enter_context(held.pop_all())
         return bench
+
+    def _unplug(self, operator: ShelfOperator, options: SimOptions) -> None:
+        self._camera_back_ns = SystemClock().now_ns() + round(_UNPLUGGED_S * 1e9)
+        assert operator.faults is not None
+        operator.faults.schedule(*self._unplugged(options))
+
+    def _unplugged(self, options: SimOptions) -> list[Fault]:
+        """Return the fault of the unplugged camera until it is plugged in again; none if it is plugged in."""
+        left_s = (self._camera_back_ns - SystemClock().now_ns()) * 1e-9 * (options.speed or 1.0)
+        return [Fault.parse(f"camera.off@0s+{left_s:.6f}s")] if left_s > 0 else []
 
     @contextmanager
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:

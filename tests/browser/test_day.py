@@ -69,7 +69,7 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
         page.wait_for_selector("#answer.found:has-text('mug-star')")
         page.locator("#enrolled img").evaluate("(image) => image.decode()")
         assert "mug-star" in page.get_attribute("#enrolled img", "alt")
-        page.wait_for_selector("#candidates li:has-text('mug-star')")
+        page.wait_for_selector("#candidates li:has-text('mug-star') .bar.c0")  # the first candidate keeps its colour
         page.wait_for_selector("#steps li:has-text('View 1: looks like')")
         page.wait_for_selector("#last li:has-text('S-1')")
         fits()
@@ -131,6 +131,14 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
         page.goto(f"{server.url}{name}")
         page.wait_for_selector(".cards button, #log li time, .setting")
         fits()
+        if name == "log":
+            sentences = page.locator("#log").inner_text()
+            for words in (
+                "enrolled lamp with 8 views.",
+                "identified mug-star, sample S-1.",
+                "rotated the table to 90.0°.",
+            ):
+                assert words in sentences
     assert server.kill(signal.SIGTERM) == 128 + signal.SIGTERM
 
 
@@ -160,6 +168,10 @@ def test_first_contact_leads_from_an_empty_table_to_an_answer(page, serve_proces
     page.wait_for_selector("rig-shelf :text('The table is empty')")
     page.click("#go:not([disabled])")
     page.wait_for_selector("#answer:has-text('No object on the table')")
+    page.goto(server.url)
+    page.click("rig-shelf button:has-text('Unplug the camera')")
+    page.wait_for_selector("#live.stale")
+    page.wait_for_selector("#live:not(.stale)")  # it is plugged in again
 
 
 def test_stop_button_above_an_open_dialog_stops_the_table(page, serve_process):

@@ -28,7 +28,7 @@ class RigShelf extends HTMLElement {
     this.replaceChildren(h("section", { "aria-labelledby": "shelf-title" },
       h("h2", { id: "shelf-title" }, "Shelf of the simulated bench"), this.words,
       h("ul", { class: "shelf", tabindex: 0, "aria-labelledby": "shelf-title" }, ...[...this.things.values()].map((button) => h("li", {}, button))),
-      h("div", { class: "row wide" }, h("button", { type: "button", class: "quiet", onclick: use("clear") }, "Clear the table"), this.light)));
+      h("div", { class: "row wide" }, h("button", { type: "button", class: "quiet", onclick: use("clear") }, "Clear the table"), this.light, h("button", { type: "button", class: "quiet", onclick: use("unplug") }, "Unplug the camera for 8 s"))));
   }
 
   showState(state) {

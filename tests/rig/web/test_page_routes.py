@@ -1,8 +1,14 @@
 """What mainly the pages ask for: pictures, silhouettes, a job's events, the shelf, settings, the camera."""
 
+import re
+from importlib.resources import files
+
 import cv2
 import numpy as np
 import pytest
+
+from rig.catalog.facts import Action
+from rig.core.errors import DeviceSilent
 
 ENROLLED = ("mug-star", "mug-white")
 
@@ -101,6 +107,21 @@ def test_person_at_the_page_places_the_objects_of_a_simulated_bench(serve):
     assert by_hand("clear")["object"] is None
     assert get(served, "shelf/teapot").headers["content-type"] == "image/jpeg"
     get(served, "shelf/none", 404)
+
+
+def test_unplugged_camera_of_a_simulated_bench_is_open_again_by_itself(serve, monkeypatch):
+    monkeypatch.setattr("sim.bench._UNPLUGGED_S", 0.2)
+    monkeypatch.setattr("rig.web.worker.REOPEN_S", 0.05)
+    served = serve("bench.sim.speed=50").opened()
+    served.client.post("/api/v1/shelf", json={"words": ["unplug"]})
+    assert served.run(kind="empty-table")["error"]["code"] == DeviceSilent.code
+    served.opened()
+    assert served.run(kind="empty-table")["state"] == "done"
+
+
+def test_each_action_of_the_log_has_its_sentence_on_the_page():
+    script = files("rig.web").joinpath("static", "records.js").read_text()
+    assert [action for action in Action if not re.search(rf'^  "?{action}"?: \(', script, re.MULTILINE)] == []
 
 
 def test_bench_whose_objects_are_placed_by_a_script_has_no_shelf(enrolled):
