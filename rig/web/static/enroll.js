@@ -1,5 +1,5 @@
 import { $, act, at, counted, duration, followJob, get, h, headline, isEnded, nextSteps, on, showJob, start, submit, table, update, valuesOf } from "./rig.js";
-import { comparisons, thumbs } from "./pictures.js";
+import { comparisons, ringDrawing, thumbs } from "./pictures.js";
 import "./shelf.js";
 
 // -- one object: a name that is known already is a choice ------------------------------------------------------------------
@@ -123,6 +123,8 @@ function take(event) {
 function showViews() {
   update($("thumbs"), ...thumbs(job, views));
   $("views-section").hidden = !views.length;
+  $("way").hidden = !views.length || isEnded(job);
+  $("way").replaceChildren(ringDrawing(views.map((view) => view.azimuth_deg)));
   $("views-title").textContent = `${counted(views.length, "view")}${rejected ? `, ${rejected} taken again` : ""}`;
 }
 

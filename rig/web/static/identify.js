@@ -21,6 +21,8 @@ chooseMode(); // a browser that reloads the page can keep the choice
 
 // -- the search, as its events tell it ------------------------------------------------------------------------------------
 
+const COLOURS = 8;
+const colours = new Map(); // of the candidates of a job: an object keeps its own after each view
 let search = null; // of the object on the table: views, steps, candidates
 let shown = null; // the answer that is large
 let ready = false; // whether events are new, not those of a page that was opened later
@@ -64,7 +66,10 @@ function take(event, job) {
     case "waiting": search.live = event.reason === "first-object" ? "Put an object on the table." : "Put the next object on the table."; break;
     case "frame_used": s.live = `Looks like ${event.name} …`; break;
     case "accepted": s.views.push(event); break;
-    case "ranked": [s.candidates, s.notEnrolled] = [event.candidates, event.decision?.not_enrolled ?? null]; break;
+    case "ranked":
+      [s.candidates, s.notEnrolled] = [event.candidates, event.decision?.not_enrolled ?? null];
+      for (const { name } of event.candidates) if (!colours.has(name)) colours.set(name, `c${colours.size % COLOURS}`);
+      break;
     case "identified": keep({ ...event, search: s }, job); break;
     case "failed": keep({ event: "failed", outcome: "failed", error: event, search: s }, job); break;
     case "recorded": if (ready) act(showLast); break;
@@ -143,7 +148,7 @@ function showSearch() {
   const best = Math.max(...candidates.map((one) => one.probability ?? one.score), s.notEnrolled ?? 0, 1e-9);
   const rows = candidates.map((one) => h("li", { title: one.probability === null ? `score ${one.score.toFixed(3)}` : percent(one.probability) },
     h("img", { src: posePicture(one.name, Math.round(one.pose_deg / 15) * 15), alt: "" }),
-    h("div", {}, one.name, h("div", { class: "bar c0" }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
+    h("div", {}, one.name, h("div", { class: `bar ${colours.get(one.name)}` }, h("i", { style: `width: ${(100 * (one.probability ?? one.score)) / best}%` })))));
   if (s.notEnrolled !== null) rows[s.notEnrolled === best ? "unshift" : "push"](h("li", { title: percent(s.notEnrolled) }, h("span", { class: "none", "aria-hidden": "true" }, "?"), h("div", { class: "soft" }, "none of the enrolled objects", h("div", { class: "bar" }, h("i", { style: `width: ${(100 * s.notEnrolled) / best}%` })))));
   $("candidates").replaceChildren(...rows);
   $("way").replaceChildren(pathDrawing(s.views.slice(-9).map((view) => view.azimuth_deg)));
@@ -185,6 +190,7 @@ followJob(["identify"], {
     job = next;
     ready = false;
     [shown, twinOf] = [null, ""];
+    colours.clear();
     newSearch();
   },
   event: take,

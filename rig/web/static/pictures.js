@@ -121,16 +121,25 @@ class RigViewer extends HTMLElement {
 }
 customElements.define("rig-viewer", RigViewer);
 
-// -- the path of a search --------------------------------------------------------------------------------------------------------------
+// -- the path of a search ----------------------------------------------------------------------------------------------------
 
 const point = (radius, degrees) => {
   const angle = (degrees * Math.PI) / 180;
   return [100 - radius * Math.sin(angle), 100 - radius * Math.cos(angle)];
 };
 
+const table = () => [h("circle", { cx: 100, cy: 100, r: 82, class: "rim" }), h("circle", { cx: 100, cy: 100, r: 16, class: "seen", opacity: 0.25 })];
+const drawing = (label, ...parts) => h("svg", { viewBox: "0 0 200 200", class: "chart", role: "img", "aria-label": label }, ...parts);
+
+/** Return a small drawing of the table with a dot for each view that is stored. */
+export function ringDrawing(azimuths) {
+  const dots = azimuths.map((azimuth) => point(82, azimuth)).map(([cx, cy]) => h("circle", { cx, cy, r: 5, class: "dot c0" }));
+  return drawing(`${azimuths.length} views around the object`, ...table(), ...dots);
+}
+
 /** Return a small drawing of the camera's way around the object, seen from above: 0° at the top, counter-clockwise. */
 export function pathDrawing(azimuths) {
-  const parts = [h("circle", { cx: 100, cy: 100, r: 82, class: "rim" }), h("circle", { cx: 100, cy: 100, r: 16, class: "seen", opacity: 0.25 })];
+  const parts = table();
   const step = Math.min(12, 40 / Math.max(azimuths.length, 1));
   azimuths.forEach((azimuth, k) => {
     if (k) {
@@ -145,5 +154,5 @@ export function pathDrawing(azimuths) {
     parts.push(h("circle", { cx: x, cy: y, r: 11, class: "stop" }), h("text", { x, y: y + 5, "text-anchor": "middle", class: "stop-number" }, String(k + 1)));
   });
   const label = azimuths.length ? `The camera's way around the object: ${azimuths.map((one) => `${one.toFixed(0)}°`).join(", ")}` : "No view yet";
-  return h("svg", { viewBox: "0 0 200 200", class: "chart", role: "img", "aria-label": label }, ...parts);
+  return drawing(label, ...parts);
 }

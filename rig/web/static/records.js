@@ -1,5 +1,5 @@
 // Calibrations, log, settings and tokens: each part runs on the page that has its element.
-import { $, act, ask, at, canOperate, counted, dayOf, definitions, details, followJob, get, h, on, pager, personOf, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
+import { $, act, ask, at, canOperate, counted, dayOf, definitions, followJob, get, h, number, on, pager, personOf, request, showJob, start, submit, table, timeOf, toast, valuesOf, when, whoami } from "./rig.js";
 
 // -- calibrations -----------------------------------------------------------------------------------------------------------
 
@@ -57,6 +57,27 @@ if ($("calibrations")) {
 
 // -- the log ------------------------------------------------------------------------------------------------------------------
 
+const OUTCOMES = { found: (name) => `identified ${name}`, unknown: () => "identified an unknown object", ambiguous: (name) => `could not tell ${name} from another object` };
+const SENTENCES = {
+  "enrollment started": (name, { replace, views }) => `began to enroll ${name}${replace ? " again" : ""}, ${counted(views, "view")}`,
+  "enrollment resumed": (name) => `continued the enrollment of ${name}`,
+  "enrollment abandoned": (name) => `ended an enrollment of ${name}`,
+  "enrollment discarded": (name) => `discarded an enrollment of ${name}`,
+  "enrollment superseded": (name) => `replaced the earlier enrollment of ${name}`,
+  enrolled: (name, { taken_again: again, views }) => (again ? `took ${counted(again.length, "view")} of ${name} again` : `enrolled ${name} with ${counted(views, "view")}`),
+  identified: (name, { outcome, sample }) => (OUTCOMES[outcome]?.(name) || "identified an object") + (sample ? `, sample ${sample}` : ""),
+  "result corrected": (name, { result, reason }) => `corrected answer ${result} to ${name || "an unknown object"}: ${reason}`,
+  renamed: (name, { before }) => `renamed ${before} to ${name}`,
+  labelled: (name) => `changed the label or note of ${name}`,
+  deleted: (name) => `deleted ${name}`,
+  undeleted: (name) => `restored ${name}`,
+  imported: (name) => `imported ${name || "objects"}`,
+  "collected garbage": () => "removed deleted objects from the disk",
+  delivered: () => "delivered objects to the shared catalog",
+  moved: (_name, { to_deg: to, ended }) => `rotated the table to ${number(to, 1)}°${ended ? `, which ended early: ${ended}` : ""}`,
+  "photographed the empty table": () => "took the empty-table image",
+};
+
 if ($("log")) {
   let lastDay = "";
   const log = pager(() => "/log?limit=100", ({ items }, isFirst) => {
@@ -65,8 +86,8 @@ if ($("log")) {
       const day = dayOf(entry.time_utc);
       if (day !== lastDay) $("log").append(h("li", { style: "display: block" }, h("h2", {}, day)));
       lastDay = day;
-      const { operator = "", ...others } = entry.details;
-      $("log").append(h("li", {}, h("time", { datetime: entry.time_utc }, timeOf(entry.time_utc)), h("div", {}, h("strong", {}, personOf(operator) || entry.user), ` ${entry.action} ${entry.object_name || ""} `, h("span", { class: "soft" }, details(others)))));
+      const words = SENTENCES[entry.action](entry.object_name, entry.details);
+      $("log").append(h("li", {}, h("time", { datetime: entry.time_utc }, timeOf(entry.time_utc)), h("div", {}, h("strong", {}, personOf(entry.details.operator || "") || entry.user), ` ${words.replace(/\.$/, "")}.`)));
     }
     if (!$("log").children.length) $("log").append(h("li", { class: "empty" }, "Nothing has happened yet."));
   });

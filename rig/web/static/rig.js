@@ -435,10 +435,10 @@ export const newestOf = (some) => some.find((job) => ACTIVE.includes(job.state))
 // -- proposed jobs: every page shows them, and an operator approves or rejects them ---------------------------------------
 
 /** Return values with their names in words, such as "views: 24; replace". */
-export function details(values) {
-  const words = (key, value) => (Array.isArray(value) ? value.map((one) => one.name ?? one).join(", ") : key.endsWith("_deg") ? `${number(value, 1)}°` : value);
+function details(values) {
+  const words = (value) => (Array.isArray(value) ? value.map((one) => one.name ?? one).join(", ") : value);
   const given = Object.entries(values).filter(([, value]) => value !== false && String(value ?? "") !== "");
-  return given.map(([key, value]) => `${key.replace(/_(deg|id)$/, "").replaceAll("_", " ")}${value === true ? "" : `: ${words(key, value)}`}`).join("; ");
+  return given.map(([key, value]) => `${key.replaceAll("_", " ")}${value === true ? "" : `: ${words(value)}`}`).join("; ");
 }
 
 function showProposals() {
