@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from inspect import signature
 from typing import Any, get_args
-from urllib.request import Request, urlopen
 
 import pytest
 
@@ -17,12 +16,11 @@ from rig.core.errors import DeviceNotFound, StateNotStored
 from rig.doctor.examination import run_checks
 from rig.motion.arrival import QUIET_COUNTS
 from rig.safety.saved_state import SERVER_FOLDER, SESSION
-from rig.web.access import Role
 from rig.web.requests import GotoRequest, JobRequest
 from rig.web.setup import Setup
 from rig.web.work import JOBS
 from tests.rig.calibrations.test_calibrations import RESULT
-from tests.rig.web.conftest import connected, over_http
+from tests.rig.web.conftest import connected
 
 AT_REST_DEG = QUIET_COUNTS * 360 / 4096
 """Angle by which two readings of a table at rest may differ."""
@@ -209,22 +207,6 @@ def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(ser
     assert job["resume"]["resume"]
     with Catalog.open(tmp_path / "catalog", clock=SystemClock(), read_only=True) as catalog:
         assert [one.views for one in catalog.objects()] == [6]
-
-
-def test_program_over_http_repeats_its_request_and_follows_the_stream_of_events(serve):
-    served = serve("bench.sim.object='lamp'", needs_login=True).opened()
-    who = {"Authorization": f"Bearer {served.server.sessions.tokens.new('cell', Role.OPERATE)}"}
-    request = {"kind": "enroll", "name": "lamp", "views": 4}
-    with over_http(served) as place, urlopen(Request(f"http://{place}/api/v1/events", headers=who), timeout=60) as sent:
-        for _ in range(2):
-            answer = served.client.post("/api/v1/jobs", json=request, headers={**who, "Idempotency-Key": "cell-7"})
-        data = (json.loads(line[len(b"data: ") :]) for line in sent if line.startswith(b"data: "))
-        seen = [{"event": "hello"}]
-        while seen[-1].get("state") != "done":
-            seen.append(next(data))
-    assert (sent.headers["content-type"], seen[-1]["id"]) == ("text/event-stream; charset=utf-8", answer.json()["id"])
-    assert [one.get("event") for one in seen].count("enrolled") == 1
-    assert len(served.worker.queue.jobs()) == 1
 
 
 def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
