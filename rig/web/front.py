@@ -6,11 +6,12 @@ the set-up as JSON on standard input.
 
 import asyncio
 import os
+import resource
 import signal
 import socket
 import sys
 import threading
-from typing import Final
+from typing import Any, Final
 
 import uvicorn
 from anyio import to_thread
@@ -23,6 +24,8 @@ from rig.web.link import Link
 from rig.web.server import Server
 from rig.web.setup import WEB_NICE, Setup, set_priority, shorten_pauses
 
+# each connection is a file; a script that opens many at once reaches the usual limit of 1,024
+MAX_FILES: Final = 65_536
 THREADS: Final = 8
 """Threads for short requests. With more, STOP would wait longer for its turn of the interpreter."""
 SWITCH_S: Final = 0.001
@@ -48,6 +51,7 @@ class _Web(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         to_thread.current_default_thread_limiter().total_tokens = THREADS
+        asyncio.get_running_loop().set_exception_handler(_log)
         await super().startup(sockets)
         self._living = asyncio.create_task(self._live())
 
@@ -55,6 +59,12 @@ class _Web(uvicorn.Server):
         while True:
             self._link.tell("alive")
             await asyncio.sleep(SIGN_OF_LIFE_S)
+
+
+def _log(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log an error of the event loop, except that no file can be opened: asyncio repeats this many times a second."""
+    if context.get("message") != "socket.accept() out of system resource":
+        loop.default_exception_handler(context)
 
 
 def uvicorn_config(server: Server) -> uvicorn.Config:
@@ -83,6 +93,9 @@ def uvicorn_config(server: Server) -> uvicorn.Config:
 def main(link_descriptor: int, socket_descriptor: int) -> None:
     """Serve until the bench's process ends the link, or a signal comes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the process that owns the bench
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
     set_priority(WEB_NICE)
     sys.setswitchinterval(SWITCH_S)
     setup = Setup.model_validate_json(sys.stdin.buffer.read())
