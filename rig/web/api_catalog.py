@@ -3,9 +3,10 @@
 import asyncio
 from collections.abc import AsyncIterator
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from anyio import open_file, to_thread
 from fastapi import Query, Request, Response
@@ -22,6 +23,7 @@ from rig.catalog.log import shown
 from rig.catalog.records import EnrollmentStatus, Provenance, RecordedOutcome, Region
 from rig.catalog.results import Result, ResultFilter, ResultRow, correct, find_result, find_results
 from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
+from rig.charts.answers import answers_a_day, drift_of_scores
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
 from rig.events.events import SimilarObjects
 from rig.plans.enroll import similar_objects
@@ -237,6 +239,12 @@ class LogRow(BaseModel):
     details: dict[str, Any]
 
 
+class Drawing(Response):
+    """A chart."""
+
+    media_type = "image/svg+xml"
+
+
 def add_results(routes: Routes, server: Server) -> None:
     @routes.watch.get("/results", tags=["results"], response_model=ListOf[ListedResult])
     def list_results(
@@ -250,6 +258,24 @@ def add_results(routes: Routes, server: Server) -> None:
             found = find_results(catalog, ResultFilter(sample, object_name, outcome))
         rows = [ListedResult(**dict(one.as_row()), id=str(one.id)) for one in found]
         return page.of(rows[::-1], lambda row: row.id)
+
+    @routes.watch.get("/results/charts/{name}", tags=["results"], response_class=Drawing)
+    def draw_results(
+        name: Literal["days", "drift"],
+        zone_min: Annotated[int, Query(ge=-1440, le=1440, description="minutes by which the clock is before UTC")] = 0,
+    ) -> Response:
+        """Draw the answers a day of two weeks, or the scores of the found objects and the last empty-table image."""
+        with server.catalog.open_to_read() as catalog:
+            rows = [one.as_row() for one in find_results(catalog)]
+            photographed = [one.time_utc for one in catalog.log() if one.action == Action.TABLE_PHOTOGRAPHED]
+        if name == "days":
+            zone = timezone(timedelta(minutes=zone_min))
+            answers = [(row.time_utc.astimezone(zone).date(), row.outcome == "found") for row in rows]
+            return Drawing(answers_a_day(answers, server.clock.utc().astimezone(zone).date()).svg(alone=True))
+        found = [row for row in rows if row.outcome == "found"]
+        last = max(photographed, default=datetime.min.replace(tzinfo=UTC))
+        before = sum(row.time_utc < last for row in found)
+        return Drawing(drift_of_scores([row.score for row in found], before).svg(alone=True))
 
     @routes.watch.get("/results/{result_id}", tags=["results"])
     def get_result(result_id: Number) -> ResultDetails:

@@ -105,7 +105,7 @@ class Server:
         self.sessions = Sessions(Tokens(setup.state_folder / SERVER_FOLDER, clock), clock, setup.local_token)
         self.lease = Lease(clock, lambda values: self.hub.publish("lease", values))
         self.catalog = BenchCatalog(setup.catalog_place, clock, self.hub)
-        self._clock = clock
+        self.clock = clock
         self._picture: dict[str, Any] = {"number": 0, "jpeg": "", "age_s": None}
         self._fetched_ns: int | None = None
         self._fetching = asyncio.Lock()
@@ -137,12 +137,12 @@ class Server:
     async def picture(self) -> tuple[bytes, float | None]:
         """Return the newest frame as JPEG (empty if there is none), and its age in seconds."""
         async with self._fetching:
-            now_ns = self._clock.now_ns()
+            now_ns = self.clock.now_ns()
             if self._fetched_ns is None or seconds_between(self._fetched_ns, now_ns) > PICTURE_S:
                 found = await asyncio.to_thread(self.bench.call, "picture", after=self._picture["number"])
                 # The frame that is known already is not sent again.
                 self._picture |= found if found["jpeg"] else {"age_s": found["age_s"]}
-                self._fetched_ns = self._clock.now_ns()
+                self._fetched_ns = self.clock.now_ns()
             return b64decode(self._picture["jpeg"]), self._picture["age_s"]
 
     def person(self, request: HTTPConnection) -> Person | None:

@@ -110,7 +110,7 @@ const canvas = document.createElement("canvas");
 const context = canvas.getContext("2d", { willReadFrequently: true });
 let sharpest = 1;
 
-/** Measure the live image: the shares of its levels, and the variance of its Laplacian. */
+/** Measure the live image: the shares of its levels, and the variance of its Laplacian; mark its sharp edges. */
 function measure() {
   const image = $("live-image");
   if (!$("camera").open || !image.naturalWidth) return;
@@ -125,22 +125,28 @@ function measure() {
     levels[Math.min(63, grey[k] >> 2)] += 1;
   }
   let [sum, squares, count] = [0, 0, 0];
+  const edges = [];
   for (let y = 1; y < height - 1; y += 1) {
     for (let x = 1; x < width - 1; x += 1) {
       const k = y * width + x;
       const value = 4 * grey[k] - grey[k - 1] - grey[k + 1] - grey[k - width] - grey[k + width];
       [sum, squares, count] = [sum + value, squares + value * value, count + 1];
+      if (Math.abs(value) > 60) edges.push([x, y]);
     }
   }
   const sharpness = squares / count - (sum / count) ** 2;
   sharpest = Math.max(sharpest * 0.995, sharpness);
   $("sharp").value = sharpness / sharpest;
   $("sharp-words").textContent = `${sharpness.toFixed(0)} of ${sharpest.toFixed(0)}`;
+  const scale = image.naturalWidth / width;
+  const marks = $("peaking").checked ? edges.map(([x, y]) => h("rect", { x: x * scale, y: y * scale, width: scale, height: scale, fill: "#3df26b" })) : [];
+  $("marks").replaceChildren(...marks);
   const most = Math.max(...levels.slice(0, 63), 1);
   const tall = (level) => Math.min(58, 58 * Math.sqrt(level / most));
   const bars = levels.map((level, k) => h("rect", { x: k * 4, y: 60 - tall(level), width: 3.4, height: tall(level), fill: "currentColor", class: k === 63 && level > 20 ? "limit" : "none" }));
   $("histogram").replaceChildren(h("svg", { viewBox: "0 0 256 60", class: "chart", style: "height: 4rem", preserveAspectRatio: "none", role: "img", "aria-label": "Levels of the image, dark at the left" }, ...bars));
 }
+$("peaking").addEventListener("change", measure);
 setInterval(measure, 400);
 
 const LOCKS = [["exposure_us", "Exposure time, µs"], ["gain", "Gain"], ["white_balance_k", "White balance, K"], ["focus", "Focus"]];

@@ -86,6 +86,10 @@ for (const id of ["search", "outcome", "since", "until"]) $(id).addEventListener
 const load = pager(() => "/results?limit=500", ({ items }, isFirst) => {
   rows = isFirst ? items : [...rows, ...items];
   render();
+  $("charts").hidden = !rows.length;
+  if (!rows.length) return;
+  const zone = -new Date().getTimezoneOffset();
+  for (const name of ["days", "drift"]) $(name).src = `${API}/results/charts/${name}?zone_min=${zone}&answers=${rows[0]?.id ?? 0}`;
 });
 on("hello", () => act(async () => {
   runs = (await get("/runs?limit=500")).items;

@@ -19,6 +19,24 @@ function chooseMode() {
 for (const radio of $("start").elements.watch) radio.addEventListener("change", chooseMode);
 chooseMode(); // a browser that reloads the page can keep the choice
 
+$("sound").checked = localStorage.getItem("rig-sound") === "1";
+$("sound").addEventListener("change", () => localStorage.setItem("rig-sound", $("sound").checked ? "1" : ""));
+
+/** Play a short tone: a rising one for a found object, a falling one for anything else. */
+function play(found) {
+  if (!$("sound").checked) return;
+  navigator.vibrate?.(found ? 80 : [80, 80, 80]);
+  const audio = new AudioContext();
+  [found ? 660 : 440, found ? 880 : 330].forEach((hertz, k) => {
+    const [tone, volume] = [audio.createOscillator(), audio.createGain()];
+    tone.frequency.value = hertz;
+    volume.gain.value = 0.15;
+    tone.connect(volume).connect(audio.destination);
+    tone.start(audio.currentTime + 0.16 * k);
+    tone.stop(audio.currentTime + 0.16 * k + 0.14);
+  });
+}
+
 // -- the search, as its events tell it ------------------------------------------------------------------------------------
 
 const COLOURS = 8;
@@ -84,6 +102,7 @@ function take(event, job) {
 
 function keep(answer, job) {
   shown = { ...answer, job: job.id, watch: job.request.watch, time: ready ? new Date().toISOString() : job.ended_utc || job.started_utc };
+  if (ready) play(shown.outcome === "found");
 }
 
 // -- what is shown --------------------------------------------------------------------------------------------------------

@@ -31,8 +31,9 @@ class RigLive extends HTMLElement {
 
   connectedCallback() {
     this.image = h("img", { id: "live-image", class: "whole", alt: "Live image of the table" });
+    this.marks = h("svg", { id: "marks", "aria-hidden": "true" }); // of the page, in pixels of the image
     this.age = h("p", { id: "live-age", role: "status", hidden: true });
-    this.frame = h("div", { class: "picture", id: "live" }, this.image, this.age);
+    this.frame = h("div", { class: "picture", id: "live" }, this.image, this.marks, this.age);
     this.append(this.frame);
     this.image.addEventListener("load", () => this.fit());
     on("status", (status) => { if (status.open) { this.region = status.region; this.fit(); } });
@@ -50,6 +51,7 @@ class RigLive extends HTMLElement {
     [style.width, style.height] = [`${(100 * width) / w}%`, `${(100 * height) / tall}%`];
     [style.left, style.top] = [`${(-100 * x) / w}%`, `${(-100 * y) / tall}%`];
     style.maxWidth = "none";
+    this.marks.setAttribute("viewBox", `${x} ${y} ${w} ${tall}`);
   }
 
   async fetchOne() {

@@ -82,6 +82,9 @@ def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     image = served.client.get(f"/api/v1/results/{answer['id']}/image")
     assert image.headers["content-type"] == "image/jpeg"
     assert image.content.startswith(b"\xff\xd8")
+    for chart in ("days?zone_min=60", "drift"):
+        drawn = served.client.get(f"/api/v1/results/charts/{chart}")
+        assert (drawn.headers["content-type"], drawn.text[:4]) == ("image/svg+xml", "<svg")
     for path in ("results/999", "results/999/image"):
         assert served.client.get(f"/api/v1/{path}").status_code == 404
 
