@@ -1,9 +1,10 @@
-"""Measure the mounting of the IMU on the platter: its tilt against the table's axis, and its level.
+"""Measure the mounting of the IMU on the platter: its tilt against the table's axis, its level, and its delay.
 
 While the table rotates, the rate is along its axis: the direction of the integrated rate in the sensor's frame is the
 axis, in any direction of gravity. At rest the accelerometer shows gravity. The part of its mean over a revolution
 that is not along the axis is its own zero error; the part that rotates with the table is the deviation of the table's
-axis from the vertical.
+axis from the vertical. During a rotation after the backlash, the encoder is ahead of the gyro by the rate times the
+delay.
 """
 
 from collections.abc import Generator, Mapping, Sequence
@@ -20,6 +21,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Contribution, Estimate, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.devices.imu import Imu, ImuSamples
+from rig.devices.servo import Servo
 from rig.motion.turntable import Turntable
 from rig.plans.steps import moved
 
@@ -34,14 +36,23 @@ MAX_TILT_DEG = 10.0
 MAX_LEVEL_DEG = 5.0  # more is a bench on a slope: the views would show leaning objects
 AXIS_GAIN_SIGMA = 0.015
 """Difference of the scales of two of the gyro's axes, from part to part."""
+MIN_RATE_DPS = 5.0
+"""Rate from which readings during a rotation count; the shaft has run through the backlash before."""
+REST_IN_BACKLASH_DEG = 0.04  # a sixth of the backlash of an XL430's gears, 0.25°
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedMove:
-    """One rotation upwards: the integrated rate (3,) about the sensor's axes, without the zero, and the σ of each."""
+    """One rotation upwards: the integrated rate (3,) about the sensor's axes, without the zero, and the σ of each.
+
+    ``lead_deg`` and ``rate_dps`` (n,): by how much the encoder is ahead of the gyro at its readings during the
+    rotation, and the table's rate there.
+    """
 
     rotation_deg: NDArray[np.float64]
     sigma_deg: float
+    lead_deg: NDArray[np.float64]
+    rate_dps: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,18 +64,19 @@ class GravityReading:
     sigma_g: float
 
 
-class _RecordedImu:
-    """An IMU that keeps the samples that are read from it."""
+class _Recorded:
+    """A device that keeps what one of its functions has returned."""
 
-    def __init__(self, imu: Imu) -> None:
-        self._imu = imu
-        self.kept: list[ImuSamples] = []
+    def __init__(self, device: object, reading: str) -> None:
+        self._device, self._reading = device, reading
+        self.kept: list[Any] = []
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._imu, name)
+        found = getattr(self._device, name)
+        return self._read if name == self._reading else found
 
-    def read_samples(self) -> ImuSamples:
-        self.kept.append(self._imu.read_samples())
+    def _read(self) -> Any:
+        self.kept.append(getattr(self._device, self._reading)())
         return self.kept[-1]
 
 
@@ -89,7 +101,7 @@ class ImuMounting(Procedure):
     """A procedure that rotates the table once, in eight steps, and reads the sensor at each stop."""
 
     result_name, devices, valid_days, plots = NAME, ("servo", "imu"), 180, (plot,)
-    reference = "gravity, and the axis about which the table rotates"
+    reference = "gravity, and the axis about which the table rotates; of the delay, encoder of the servo"
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         config = bench.config
@@ -101,18 +113,21 @@ class ImuMounting(Procedure):
         moves: list[RecordedMove] = []
         levels: list[GravityReading] = []
         # A turntable keeps the rate about its own axis only; the tilt needs all three.
-        recorded_bench, imu = copy(bench), _RecordedImu(bench.imu)
-        recorded_bench.imu = cast(Imu, imu)
+        recorded_bench = copy(bench)
+        servo, imu = _Recorded(bench.servo, "read_state"), _Recorded(bench.imu, "read_samples")
+        recorded_bench.servo, recorded_bench.imu = cast(Servo, servo), cast(Imu, imu)
         with Turntable(recorded_bench) as table, returning(table) as goto:
             for index in range(STEPS + 1):
                 if index == 0:
                     yield moved(0, goto(first_deg))
                 else:
+                    servo.kept.clear()
                     imu.kept.clear()
                     _observe_rest(bench, table)
                     before_ns = bench.clock.now_ns()
                     move = goto(first_deg + index * 360.0 / STEPS)
-                    recorded = _recorded_move(imu.kept, before_ns, column)
+                    encoder = [(state.time_ns, config.table.direction * state.position_deg) for state in servo.kept]
+                    recorded = _recorded_move(imu.kept, encoder, before_ns, column, sign)
                     if recorded is not None:
                         moves.append(recorded)
                     yield moved(index, move)
@@ -124,7 +139,7 @@ class ImuMounting(Procedure):
 
 
 def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *, column: int, sign: int) -> Evaluation:
-    """Evaluate the tilt and the levels.
+    """Evaluate the tilt, the levels and the delay.
 
     ``moves`` and ``levels`` are the measurements over a whole revolution. ``column`` and ``sign`` are the sensor's axis
     that is along the table's axis, and +1 if it points up.
@@ -155,6 +170,7 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
         found.reject_if(wrong, RejectionCode.WRONG_AXIS, axis="xyz"[nearest], sign=right_sign)
         found.reject_if(not wrong, RejectionCode.TILT_TOO_LARGE, tilt_deg=tilt_deg, limit_deg=MAX_TILT_DEG)
     found.estimates |= _levels(levels, axis, column, tilts)
+    _estimate_delay(found, moves)
     level_deg = hypot(found.estimates["axis_x"].value, found.estimates["axis_y"].value)
     found.reject_above(MAX_LEVEL_DEG, RejectionCode.NOT_LEVEL, level_deg=level_deg)
     return found
@@ -188,6 +204,23 @@ def _levels(
     return estimates
 
 
+def _estimate_delay(found: Evaluation, moves: Sequence[RecordedMove]) -> None:
+    """Estimate the delay of the gyro's time stamps relative to the encoder's readings."""
+    rate = np.concatenate([move.rate_dps for move in moves])
+    lead = np.concatenate([move.lead_deg for move in moves])
+    # Readings of one rotation share the encoder's error at its rest, so the rotations are the independent data. A
+    # vibrating platter comes to rest a little inside the backlash, always on the same side.
+    each = [(move.rate_dps @ move.lead_deg) / (move.rate_dps @ move.rate_dps) for move in moves if move.rate_dps.size]
+    scatter_s = float(np.std(each, ddof=1)) / sqrt(len(each))
+    found.estimate(
+        "delay",
+        rate @ lead / (rate @ rate),
+        "s",
+        Contribution("scatter of the moves", "A", scatter_s, "s"),
+        Contribution("rest of the platter in the backlash", "B", REST_IN_BACKLASH_DEG, "°", 1 / float(np.median(rate))),
+    )
+
+
 def _observe_rest(bench: Bench, table: Turntable) -> None:
     """Wait at rest until the gyro's zero is measured."""
     for _ in range(5):
@@ -204,8 +237,13 @@ def _paced(bench: Bench, table: Turntable) -> Generator[None, None, None]:
             table.check_still()
 
 
-def _recorded_move(samples: Sequence[ImuSamples], before_ns: int, column: int) -> RecordedMove | None:
-    """Return the record of a rotation that began after ``before_ns``; None if samples were lost."""
+def _recorded_move(
+    samples: Sequence[ImuSamples], encoder: Sequence[tuple[int, float]], before_ns: int, column: int, sign: int
+) -> RecordedMove | None:
+    """Return the record of a rotation that began after ``before_ns``; None if samples were lost.
+
+    ``encoder`` has the times of the encoder's readings, and the table's angles.
+    """
     if not samples or any(part.lost for part in samples):
         return None
     times = np.concatenate([part.time_ns for part in samples])
@@ -219,4 +257,14 @@ def _recorded_move(samples: Sequence[ImuSamples], before_ns: int, column: int) -
     # The noise of the rotation itself, and that of the zero from the rest before, over the same time.
     span_s, rest_s = float(moving.sum()) * step_s, float(at_rest.sum()) * step_s
     sigma_deg = noise * sqrt(step_s * span_s + step_s * span_s**2 / rest_s)
-    return RecordedMove((rates[moving] - rates[at_rest].mean(axis=0)).sum(axis=0) * step_s, sigma_deg)
+    net_dps = rates - rates[at_rest].mean(axis=0)
+    # The whole rotation gives the scale of the gyro relative to the encoder; what remains during it is the delay.
+    read_ns, read_deg = np.array([one for one in encoder if one[0] <= times[-1]]).T
+    since = read_ns >= before_ns
+    encoder_deg = read_deg[since] - read_deg[~since].mean()
+    own_dps = sign * net_dps[:, column]
+    gyro_deg = np.interp(read_ns[since], times[moving], np.cumsum(own_dps[moving]) * step_s)
+    rate_dps = np.interp(read_ns[since], times, own_dps)
+    cruising = np.abs(rate_dps) > MIN_RATE_DPS
+    lead_deg = encoder_deg - encoder_deg[-1] / gyro_deg[-1] * gyro_deg
+    return RecordedMove(net_dps[moving].sum(axis=0) * step_s, sigma_deg, lead_deg[cruising], rate_dps[cruising])

@@ -32,7 +32,8 @@ def measured(
     axis=AXIS, *, zero_g=(0.01, -0.02, 0.03), table_axis_deg=(0.0, 0.0)
 ) -> tuple[list[RecordedMove], list[GravityReading]]:
     """Return the measurements of a bench without noise."""
-    moves = [RecordedMove(45.0 * axis, 0.01) for _ in range(8)]
+    rate = np.linspace(10.0, 90.0, 20)
+    moves = [RecordedMove(45.0 * axis, 0.01, 0.002 * rate, rate) for _ in range(8)]
     levels = []
     for angle in np.arange(8) * 45.0:
         c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
