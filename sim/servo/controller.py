@@ -4,7 +4,7 @@ from enum import IntEnum
 from math import cos, radians, sin
 
 from sim.servo.control_table import Memory
-from sim.servo.models import EXTENDED_POSITION_MODE, GAINS, POSITION_MODE, ServoModel
+from sim.servo.models import EXTENDED_POSITION_MODE, GAINS, POSITION_MODE, VELOCITY_MODE, ServoModel
 from sim.servo.motor import Motor
 from sim.world import World
 
@@ -27,7 +27,7 @@ class Controller:
 
     Position registers count the steps of the model's row from the encoder's zero. Whole revolutions are counted until
     `wrap_position`, as in the e-manual. Gains, PWM and current limits, Drive Mode and Homing Offset are stored but have
-    no effect, and in velocity mode nothing moves: before it moves a servo, the rig has set the last three.
+    no effect: before it moves a servo, the rig has set the last two.
     `harmonics_deg` is the encoder's error over a revolution: cosine and sine of the first and the second harmonic.
     """
 
@@ -85,7 +85,7 @@ class Controller:
 
     def pursue_position(self) -> None:
         """Plan the profile to Goal Position (e-manual, "What is the Profile"); other modes ignore it."""
-        if self._memory["Operating Mode"] not in (POSITION_MODE, EXTENDED_POSITION_MODE):
+        if self._memory["Operating Mode"] == VELOCITY_MODE:
             return
         goal_deg = self._degrees(self._memory["Goal Position"])
         velocity, acceleration = self._memory["Profile Velocity"], self._memory["Profile Acceleration"]
@@ -102,6 +102,17 @@ class Controller:
         else:
             peak = float(abs(self._motor.commanded.velocity_dps).max())
             self._profile = Profile.TRAPEZOIDAL if peak >= v_max * (1 - 1e-9) else Profile.TRIANGULAR
+
+    def pursue_velocity(self) -> None:
+        """Ramp to Goal Velocity; other modes ignore it."""
+        if self._memory["Operating Mode"] != VELOCITY_MODE:
+            return
+        fastest, a_max = self._motor.fastest_dps, self._motor.steepest_dps2
+        goal_dps = min(max(self._memory["Goal Velocity"] * self._row.dps_per_unit, -fastest), fastest)
+        acceleration = self._memory["Profile Acceleration"]
+        a_max = min(a_max, acceleration * self._row.dps2_per_unit) if acceleration else a_max
+        self._motor.rotate_at(goal_dps, max(a_max, _STANDSTILL))
+        self._profile = Profile.TRAPEZOIDAL if acceleration else Profile.STEP
 
     def wrap_position(self) -> None:
         """Reset the count of revolutions: the position continues from within one revolution."""
@@ -146,6 +157,8 @@ class Controller:
     def _moving_status(self, present: int, target: int) -> int:
         if not self._memory["Torque Enable"]:
             return 0
+        if self._memory["Operating Mode"] == VELOCITY_MODE:
+            return self._profile << 4
         in_position = abs(self._memory["Goal Position"] - present) * self._row.deg_per_count < IN_POSITION_DEG
         ongoing = self._profile != Profile.STEP and self._motor.profile_ongoing
         following_error = abs(target - present) * self._row.deg_per_count > FOLLOWING_ERROR_DEG

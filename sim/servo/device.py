@@ -73,7 +73,8 @@ class SimServo:
             "Min Voltage Limit": self._check_shutdown,
             "Torque Enable": self._on_torque_enable,
             "Bus Watchdog": self._arm_watchdog,
-            "Goal Position": self._on_goal,
+            "Goal Velocity": lambda: self._on_goal(self._controller.pursue_velocity),
+            "Goal Position": lambda: self._on_goal(self._controller.pursue_position),
         }
         self._start()
 
@@ -282,9 +283,9 @@ class SimServo:
         self._arm_watchdog()
         self._supervise()
 
-    def _on_goal(self) -> None:
+    def _on_goal(self, pursue: Callable[[], None]) -> None:
         if self.memory["Torque Enable"]:  # in the drive mode "torque on by goal update", too: the rig switches it off
-            self._controller.pursue_position()
+            pursue()
             self._supervise()
 
     def _check_shutdown(self) -> None:

@@ -16,7 +16,7 @@ from rig.devices.dynamixel.registers import model_row
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate."""
 
-POSITION_MODE, EXTENDED_POSITION_MODE = 3, 4
+VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE = 1, 3, 4
 
 GAINS = (
     *("Velocity I Gain", "Velocity P Gain", "Position D Gain", "Position I Gain", "Position P Gain"),

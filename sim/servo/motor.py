@@ -38,7 +38,7 @@ class MotorState:
 
 
 class Motor:
-    """A position-controlled shaft in its own degrees: ``gear_ratio`` revolutions for one of the table.
+    """A position- or speed-controlled shaft in its own degrees: ``gear_ratio`` revolutions for one of the table.
 
     The shaft follows the commanded trajectory by its `Response`, without noise exactly. If it is jammed it does not
     move, and the controller's error and the load grow. `settle` updates heat and overload with the present
@@ -83,7 +83,7 @@ class Motor:
     @property
     def busy(self) -> bool:
         """Whether the load varies: the shaft rotates, or is blocked while driven."""
-        moves = max(self.commanded.end_s, self._still_s) > self._now_s()
+        moves = max(self.commanded.end_s, self._still_s) > self._now_s() or bool(self.commanded.velocity_dps[-1])
         return self.driven and (self._jammed or moves)
 
     @property
@@ -159,6 +159,10 @@ class Motor:
         state = self.state()
         self._follow(to_position(self._now_s(), state.target_deg, state.target_dps, angle_deg, v_max, a_max))
 
+    def rotate_at(self, speed_dps: float, a_max: float) -> None:
+        state = self.state()
+        self._follow(to_velocity(self._now_s(), state.target_deg, state.target_dps, speed_dps, a_max))
+
     # -- for tests and faults -------------------------------------------------------------------------------------
 
     def jam(self) -> None:
@@ -168,13 +172,16 @@ class Motor:
         self._drive(rest(self._now_s(), self.shaft()[0]))
 
     def free(self) -> None:
-        """Release a jammed shaft; it moves to its commanded angle at maximum speed."""
+        """Release a jammed shaft; it moves at maximum speed to its commanded angle, or at its commanded speed."""
         self.settle()
         self._jammed = False
         if not self.driven:
             return
-        goal = float(self.commanded.position_deg[-1])
-        self._follow(to_position(self._now_s(), self.shaft()[0], 0.0, goal, self.fastest_dps, self.steepest_dps2))
+        angle_deg, goal = self.shaft()[0], float(self.commanded.position_deg[-1])
+        if cruise := float(self.commanded.velocity_dps[-1]):
+            self._follow(to_velocity(self._now_s(), angle_deg, 0.0, cruise, self.steepest_dps2))
+        else:
+            self._follow(to_position(self._now_s(), angle_deg, 0.0, goal, self.fastest_dps, self.steepest_dps2))
 
     def set_friction(self, friction: float | None = None, steady_load: float = 0.0) -> None:
         """Set the friction at rest, and a steady load that pushes clockwise, as shares of the stall torque.
@@ -185,7 +192,7 @@ class Motor:
         self.settle()
         self._friction = self._own_friction if friction is None else friction
         self._steady_load = min(max(steady_load, -self._friction), self._friction)
-        if self.driven and not self._jammed and not self.profile_ongoing:
+        if self.driven and not self._jammed and not self.commanded.velocity_dps[-1] and not self.profile_ongoing:
             goal = float(self.commanded.position_deg[-1])
             self._follow(
                 to_position(self._now_s(), *self.shaft(), goal, self.fastest_dps, self.steepest_dps2),

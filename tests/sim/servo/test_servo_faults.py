@@ -177,6 +177,14 @@ def test_servo_continues_after_a_short_jam(line: Line) -> None:
     line.sleep(3.0)
     assert line.read("Present Position") == 4000
     assert line.read("Hardware Error Status") == 0
+    line.put(Torque_Enable=0)
+    line.put(Operating_Mode=1, Torque_Enable=1, Goal_Velocity=50)
+    line.servos[1].jam()
+    line.sleep(0.2)
+    assert line.read("Present Velocity") == 0
+    line.servos[1].free()
+    line.sleep(0.5)
+    assert line.read("Present Velocity") == 50
 
 
 def test_jam_without_torque_causes_no_overload(line: Line) -> None:

@@ -30,6 +30,17 @@ def three(line: Line) -> Line:
 # -- ping, read, write ---------------------------------------------------------------------------------------------
 
 
+def test_bytes_on_the_wire_equal_the_emanuals_and_the_sdks(line: Line) -> None:
+    assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, 0)
+    assert line.sent(Sender.HOST) == [bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))]
+    line.frames.clear()
+    recorded = []
+    write = line.port.writePort
+    line.port.writePort = lambda packet: recorded.append(bytes(packet)) or write(packet)
+    line.write("Goal Position", 512)
+    assert recorded == line.sent(Sender.HOST) == [bytes.fromhex("FFFFFD00010900037400000200 00CA89".replace(" ", ""))]
+
+
 @pytest.mark.parametrize(
     ("model", "number"),
     [("xl430_w250", 1060), ("xm430_w350", 1020), ("xl330_m288", 1200), ("mx_28", 30), ("ph54_200_s500", 2020)],

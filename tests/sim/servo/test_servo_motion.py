@@ -81,6 +81,22 @@ def test_goal_and_torque_written_again_during_a_move_change_nothing(line: Line) 
     assert line.read("Present Position") == line.read("Goal Position") == 6000
 
 
+def test_velocity_mode_ramps_and_keeps_rotating(line: Line) -> None:
+    line.put(Operating_Mode=1, Profile_Acceleration=10, Torque_Enable=1, Goal_Velocity=-100)
+    line.sleep(0.2)
+    at_200_ms = line.read("Present Velocity")
+    assert at_200_ms == pytest.approx(-0.2 * 10 * DPS2_PER_UNIT / DPS_PER_UNIT, abs=1)
+    line.sleep(2.0)
+    assert line.read("Present Velocity") == line.read("Velocity Trajectory") == -100
+    before, start_ns = line.shaft(), line.clock.now_ns()
+    line.sleep(10.0)
+    rotated = -100 * DPS_PER_UNIT * (line.clock.now_ns() - start_ns) * 1e-9
+    assert line.shaft() - before == pytest.approx(rotated)
+    line.put(Goal_Velocity=0)
+    line.sleep(2.0)
+    assert line.servos[1].motor.busy is False
+
+
 def test_new_goal_during_a_move_is_reached_without_a_jerk(line: Line) -> None:
     extended(line)
     line.put(Goal_Position=6000)
