@@ -1,10 +1,10 @@
 """Time from STOP to torque off, by the servo's own log, in the situations in which STOP could be late.
 
-The servo is simulated in real time by another process, which logs each instruction that switches its torque. A table in
-motion brakes before its torque goes off, which takes about half a second. All processes use the same monotonic clock.
-``--load 8`` runs eight busy processes beside each measurement but the idle ones. The simulated devices, the browser and
-the clients that press STOP have a higher priority if the system permits it (for example to root): at a real bench they
-do not share the computer's cores.
+The servo is simulated in real time by another process, which logs each goal, and each instruction that switches its
+torque. A table in motion brakes before its torque goes off, which takes about half a second. All processes use the same
+monotonic clock. ``--load 8`` runs eight busy processes beside each measurement but the idle ones. The simulated
+devices, the browser and the clients that press STOP have a higher priority if the system permits it (for example to
+root): at a real bench they do not share the computer's cores.
 """
 
 import argparse
@@ -32,11 +32,14 @@ RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 LOGGING_BENCH = """
 import sys, time
 from sim.servo.device import SimServo
-log, switch = open(sys.argv.pop(1), "a", buffering=1), SimServo._on_torque_enable
+log, switch, rotate = open(sys.argv.pop(1), "a", buffering=1), SimServo._on_torque_enable, SimServo._on_goal
 def switched(servo):
     log.write(f"{time.monotonic_ns()} {'on' if servo.memory['Torque Enable'] else 'off'}\\n")
     switch(servo)
-SimServo._on_torque_enable = switched
+def rotated(servo, pursue):
+    log.write(f"{time.monotonic_ns()} goal\\n")
+    rotate(servo, pursue)
+SimServo._on_torque_enable, SimServo._on_goal = switched, rotated
 from rig.cli.main import main
 main()
 """
@@ -100,10 +103,11 @@ def beside(held: ExitStack, *program: str) -> None:
 class ServedBench:
     """A served bench whose servo has a log."""
 
-    def __init__(self, folder: Path, url: str, token: str) -> None:
+    def __init__(self, folder: Path, url: str, token: str, pid: int) -> None:
         self.folder = folder
         self.url = url
         self.token = token
+        self.pid = pid
         self.state = folder / "state" / "sim-bench"
         self.failed_starts = 0
 
@@ -114,13 +118,19 @@ class ServedBench:
         with urllib.request.urlopen(request, timeout=60) as answer:
             return json.load(answer)
 
-    def off_ns(self, after_ns: int) -> int:
-        """Return when the servo's torque went off, after a time."""
+    def stopped_ns(self, after_ns: int) -> tuple[int, int]:
+        """Return when the servo got the goal at which it stopped, and when its torque went off, after a time.
+
+        A table at rest gets no goal: both are then the same.
+        """
         while True:
+            goal_ns = None
             for line in (self.folder / "servo.log").read_text().splitlines():
                 time, what = line.split()
                 if int(time) > after_ns and what == "off":
-                    return int(time)
+                    return goal_ns or int(time), int(time)
+                if int(time) > after_ns and what == "goal":
+                    goal_ns = int(time)
             CLOCK.sleep(0.02)
 
     def measure(self, stop: Callable[[], int]) -> float:
@@ -136,12 +146,12 @@ class ServedBench:
             CLOCK.sleep(0.05)
         CLOCK.sleep(random.uniform(0.3, 0.8))
         began_ns = stop()
-        return (self.off_ns(began_ns) - began_ns) * 1e-9
+        return (self.stopped_ns(began_ns)[1] - began_ns) * 1e-9
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[ServedBench]:
-    """Serve a bench with an enrolled object, which is on its table."""
+def served(folder: Path, objects: tuple[str, ...] = ("lamp",), views: int = 36) -> Iterator[ServedBench]:
+    """Serve a bench with enrolled objects; the last one is on its table."""
     home = folder / "bench"
     log = folder / "bench" / "servo.log"
     simulated = subprocess.Popen(
@@ -153,10 +163,10 @@ def served(folder: Path) -> Iterator[ServedBench]:
     simulated.stdout.readline()
     log.symlink_to(folder / "servo.log")
     base = ["--config", str(home / "rig.toml"), "--set", f"catalog.path={folder}/catalog"]
-    # on a bench with a clock of its own: this takes less time than on that of real time
-    words = ["--bench", "sim", "--set", "bench.sim.object=lamp", "--views", "36"]
-    subprocess.run([*RIG, "enroll", "lamp", *base, *words], check=True, capture_output=True)
-    subprocess.run([*RIG, "sim-bench", "put", "lamp", "--folder", str(home)], check=True, capture_output=True)
+    for name in objects:  # on a bench with a clock of its own: this takes less time than on that of real time
+        words = ["--bench", "sim", "--set", f"bench.sim.object={name}", "--views", str(views)]
+        subprocess.run([*RIG, "enroll", name, *base, *words], check=True, capture_output=True)
+    subprocess.run([*RIG, "sim-bench", "put", objects[-1], "--folder", str(home)], check=True, capture_output=True)
     made = subprocess.run(
         [*RIG, "serve", *base, "--new-token", "operator", "--role", "operate"],
         check=True,
@@ -173,7 +183,7 @@ def served(folder: Path) -> Iterator[ServedBench]:
     assert server.stderr is not None
     url = next(found.group() for line in server.stderr if (found := re.search(r"http://\S+/", line)))
     threading.Thread(target=server.stderr.read, daemon=True).start()
-    bench = ServedBench(home, url, token)
+    bench = ServedBench(home, url, token, server.pid)
     try:
         job = bench.call("jobs", {"kind": "reference", "here": True})
         while (job := bench.call(f"jobs/{job['id']}"))["state"] not in ("done", "failed"):
