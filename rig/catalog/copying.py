@@ -5,11 +5,13 @@ It has the enrollments that searches use, with their descriptions, but no images
 Decision: docs/decisions/0011.
 """
 
+import fcntl
 import json
+import os
 import shutil
 from collections import defaultdict
-from collections.abc import Collection
-from contextlib import suppress
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,11 +29,13 @@ from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import CatalogError, CatalogUnavailable
-from rig.core.files import json_values
+from rig.core.errors import CatalogBusy, CatalogError, CatalogUnavailable
+from rig.core.files import json_values, no_follow
 
 _COPY: Final = "copy"
 """Property of a local copy: of which catalog it is, and when it was made."""
+_NEW: Final = ".copy-"
+"""Begins the name of the folder in which a copy is made."""
 _PATIENCE: Final = 20  # a server that is away costs one wait in twenty-one times that long
 
 
@@ -116,8 +120,8 @@ def update_copy(catalog: Catalog) -> bool:
     Only new and deleted objects are brought over. A copy that is damaged, of another catalog, or different in another
     way (an object has another name, or was described again) is made again and takes the place of the former one.
 
-    Raises `CatalogDamaged`: the catalog is not as it was stored; the copy stays as it is. `CatalogError`: one of them
-    cannot be used.
+    Raises `CatalogDamaged`: the catalog is not as it was stored; the copy stays as it is. `CatalogError`,
+    `CatalogBusy`: one of them cannot be used, or another program makes the copy.
     """
     place, clock = catalog.place, catalog.clock
     theirs = _searched(catalog)
@@ -139,13 +143,30 @@ def update_copy(catalog: Catalog) -> bool:
                 _sign(copy, own)
                 return ours != theirs
     # Make another one.
-    with catalog.database.catalog_errors(), TemporaryDirectory(prefix=".copy-", dir=place.path) as folder:
-        with Catalog.open(Path(folder, place.copy_folder.name), clock=clock) as made:
-            _fill(made, CatalogSource(catalog))
-            _sign(made, own)
-        shutil.rmtree(place.copy_folder, ignore_errors=True)
-        made.path.rename(place.copy_folder)
+    with catalog.database.catalog_errors(), only_program(place.path / "copying", "makes the local copy"):
+        for left in place.path.glob(f"{_NEW}*"):  # by a program that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        with TemporaryDirectory(prefix=_NEW, dir=place.path) as folder:
+            with Catalog.open(Path(folder, place.copy_folder.name), clock=clock) as made:
+                _fill(made, CatalogSource(catalog))
+                _sign(made, own)
+            shutil.rmtree(place.copy_folder, ignore_errors=True)
+            made.path.rename(place.copy_folder)
     return True
+
+
+@contextmanager
+def only_program(lock: Path, doing: str) -> Iterator[None]:
+    """Prevent that another program does the same. Raises `CatalogBusy`: one does it, "makes the local copy"."""
+    held = no_follow(str(lock), os.O_RDWR | os.O_CREAT, mode=0o600)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it when the process ends
+    except BlockingIOError as error:
+        raise CatalogBusy(f"Another program {doing} now.", next_step="Try again later.") from error
+    else:
+        yield
+    finally:
+        os.close(held)
 
 
 def _searched(catalog: Catalog) -> dict[str, tuple[object, ...]]:

@@ -5,11 +5,9 @@ Commands and the web server open their catalogs here, so that each of them works
 Decision: docs/decisions/0011.
 """
 
-import fcntl
-import os
 import threading
-from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Collection
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -22,7 +20,7 @@ from sqlalchemy.orm import Session as Transaction
 import hbr
 from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog, OpenEnrollment
-from rig.catalog.copying import Attempts, open_copy, open_or_copy
+from rig.catalog.copying import Attempts, only_program, open_copy, open_or_copy
 from rig.catalog.facts import Action, Entry
 from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.records import EnrollmentStatus, JsonObject
@@ -32,7 +30,6 @@ from rig.catalog.upkeep import collect_garbage
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import (
-    CatalogBusy,
     CatalogDamaged,
     CatalogError,
     CatalogUnavailable,
@@ -40,7 +37,6 @@ from rig.core.errors import (
     ObjectNotFound,
     RigError,
 )
-from rig.core.files import no_follow
 from rig.core.next_steps import Do
 from rig.views.description import BENCH_DESCRIPTOR
 
@@ -171,7 +167,8 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
     Raises `CatalogUnavailable`: the server stopped answering; what was not delivered stays in the journal.
     """
     done = []
-    with _only_delivery(journal):
+    # Another program that delivers would remove objects that this one reads.
+    with only_program(journal.path / _LOCK, "delivers the journal"):
         for one in journal.objects():
             if one.enrolled_utc is not None:
                 conflict = _deliver(journal, server, one.name, replaces=one.name in replacing)
@@ -180,20 +177,6 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
             collect_garbage(journal)
         _deliver_answers(journal, server)
     return done
-
-
-@contextmanager
-def _only_delivery(journal: Catalog) -> Iterator[None]:
-    """Prevent a delivery of the journal by another program: each would remove objects that the other one reads."""
-    lock = no_follow(str(journal.path / _LOCK), os.O_RDWR | os.O_CREAT, mode=0o600)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it when the process ends
-    except BlockingIOError as error:
-        raise CatalogBusy("Another program delivers the journal now.", next_step="Try again later.") from error
-    else:
-        yield
-    finally:
-        os.close(lock)
 
 
 def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) -> RigError | None:

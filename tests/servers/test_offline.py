@@ -13,7 +13,7 @@ from sqlalchemy import text
 from typer.testing import Result
 
 from rig.catalog import Catalog, derived
-from rig.catalog.copying import open_copy, open_or_copy, update_copy
+from rig.catalog.copying import only_program, open_copy, open_or_copy, update_copy
 from rig.catalog.jobs import finished
 from rig.catalog.journal import Journal, deliver, journal_folder, waiting
 from rig.catalog.results import correct, find_results
@@ -21,7 +21,7 @@ from rig.catalog.results import record as record_result
 from rig.catalog.verify import CatalogProblem, verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
-from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable, ObjectExists
+from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogUnavailable, ObjectExists
 from rig.core.next_steps import Do
 from rig.events.events import NoteCode
 from rig.plans.tray import TrayItem, left_to_enroll
@@ -101,8 +101,13 @@ def test_damaged_copy_and_copy_of_another_catalog_are_made_again(
     file.write_bytes(file.read_bytes()[:8000])
     with pytest.raises(CatalogUnavailable, match="no copy"):
         open_copy(place, CLOCK)
+    left = place.path / ".copy-killed" / place.copy_folder.name  # by a program that was killed
+    left.mkdir(parents=True)
     with Catalog.open(place, clock=CLOCK) as catalog:
+        with only_program(place.path / "copying", "makes the local copy"), pytest.raises(CatalogBusy):
+            update_copy(catalog)
         assert update_copy(catalog)
+        assert not list(place.path.glob(".copy-*"))
         same_copy(place, catalog).close()
     other = place_in(postgres.url, tmp_path / uuid.uuid4().hex, str(tmp_path / "other"))
     moved = CatalogPlace(place.path, other.url, other.images)
