@@ -29,8 +29,9 @@ from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.catalog.upkeep import NAMED_IMAGES
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.clock import Clock
-from rig.core.errors import ImportRejected, RigError
+from rig.core.errors import ExportFailed, ImportRejected, RigError
 from rig.core.files import open_new
+from rig.core.next_steps import Do
 from rig.views import image_files as images
 
 # more than a shared catalog has images; a bundle is from others, and must not fill memory or disk
@@ -58,6 +59,16 @@ def write_bundle(path: Path, source: CatalogSource) -> int:
         info.file_size = made_file.stat().st_size
         with archive.open(info, "w") as stored, made_file.open("rb") as database:
             shutil.copyfileobj(database, stored)
+        # A bundle is for others, who must be able to read it: this program tries it first.
+        archive.close()
+        try:
+            with read_bundle(Path(file.name), source.catalog.clock):
+                pass
+        except ImportRejected as error:
+            raise ExportFailed(
+                f"{path} was not written, because no import would accept it: {error.what}",
+                next_step=(Do.VERIFY_CATALOG(), "Or export fewer objects into each bundle."),
+            ) from error
     return done.objects
 
 

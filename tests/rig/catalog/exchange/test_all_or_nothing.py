@@ -12,7 +12,7 @@ from rig.catalog.derived import views
 from rig.catalog.exchange.photographs import Photographs, read_folder
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.catalog.verify import verify
-from rig.core.errors import CatalogError, ImportRejected, ObjectExists
+from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists
 from sim.clock import VirtualClock
 from tests.programs import server
 from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, fill, finished
@@ -168,6 +168,14 @@ class TestOnlyOnce:
         expected = model(full)
         monkeypatch.setattr("rig.catalog.describing.computed", None)
         assert model(catalog) == expected
+
+    def test_damaged_image_of_a_catalog_is_not_transferred(self, full: Catalog, open_catalog: OpenCatalog) -> None:
+        path = full.image_path(full.object("mug-white").views[0].image)
+        path.write_bytes(path.read_bytes()[:-1] + b"x")
+        catalog = open_catalog("catalog")
+        with pytest.raises(CatalogDamaged, match="are missing or are not those"):
+            run_import(catalog, CatalogSource(full))
+        assert untouched(catalog, images=True)
 
     def test_damaged_empty_table_image_of_a_catalog_is_not_transferred(
         self, full: Catalog, open_catalog: OpenCatalog

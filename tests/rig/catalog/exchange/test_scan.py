@@ -156,6 +156,24 @@ def test_colmap_reconstructs_boards_within_a_pixel(source, tmp_path):
     assert on_card.sum() > 10
 
 
+def test_colmap_reads_the_scan(source, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_scan(tmp_path / "scan", source, ScanFormat.COLMAP, results())
+    write_scan(tmp_path / "other", source, ScanFormat.NERFSTUDIO, results())
+    read = pycolmap.Reconstruction(str(tmp_path / "scan" / "sparse" / "0"))
+    frames = json.loads((tmp_path / "other" / "transforms.json").read_text())["frames"]
+    assert read.num_images() == len(frames)
+    (camera,) = read.cameras.values()
+    assert list(camera.params[:4]) == pytest.approx([frames[0][name] for name in ("fl_x", "fl_y", "cx", "cy")])
+    for image in read.images.values():
+        (frame,) = (one for one in frames if Path(one["file_path"]).name == image.name)
+        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        to_camera = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        assert pose.matrix() == pytest.approx(to_camera[:3], abs=1e-6)
+    exif = pycolmap.Bitmap.read(str(tmp_path / "scan" / "images" / "000.png"), True)
+    assert exif is not None
+
+
 def test_colmap_files_name_one_camera_and_each_image_with_its_exif(source, tmp_path):
     write_scan(tmp_path / "scan", source, ScanFormat.COLMAP, results())
     folder = tmp_path / "scan" / "sparse" / "0"
