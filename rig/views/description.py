@@ -34,6 +34,21 @@ DENSE_DESCRIPTORS: Final = (LIGHT, FULL)
 DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
 
+_TEXT: Final[Mapping[str, str]] = {
+    IssueCode.TABLE_SIZE: "the empty-table image has another size than the frames",
+    IssueCode.TABLE_AZIMUTH: "the camera moves, and no empty-table image was taken near the azimuth",
+    IssueCode.TABLE_DIFFERS: "the surroundings do not look like the empty-table image",
+    IssueCode.BACKDROP_EXPOSURE: "the backdrop is too dark or overexposed to measure its colour",
+    IssueCode.BACKDROP_COLOURS: "the backdrop has several colours, so none can be taken for grey",
+    IssueCode.BACKDROP_COLOURFUL: "the backdrop is not grey",
+    IssueCode.BACKDROP_LEVEL: "the backdrop is too dark or too bright to correct the exposure",
+    IssueCode.BACKGROUND_NOT_PLAIN: "the background is not plain",
+    IssueCode.DOUBTFUL_OUTLINE: "the platter or the backdrop may be inside the box",
+    IssueCode.NO_GUESS: "no part of the frame stands out",
+    IssueCode.NO_OBJECT: "no object was found while the table rotated",
+    IssueCode.NO_DIFFERENCE: "nothing differs from the background",
+}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescribedView:
@@ -257,7 +272,7 @@ def segmentation_words(summary: Mapping[str, Any]) -> str:
     if not summary["views"]:
         return ""
     guessed = f", guessed in {summary['guessed']}" if summary["guessed"] else ""
-    issues = "".join(f"; {code.replace('-', ' ')} ({count})" for code, count in summary["issues"].items())
+    issues = "".join(f"; {_TEXT.get(code, code)} ({count})" for code, count in summary["issues"].items())
     return (
         f"object found in {summary['found']} of {summary['views']} views{guessed}, illumination corrected in "
         f"{summary['corrected']}{issues}"

@@ -6,9 +6,11 @@ import pytest
 from numpy.typing import NDArray
 
 import hbr
+from hbr.segmentation import IssueCode
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views.description import (
+    _TEXT,
     BENCH_DESCRIPTOR,
     DESCRIPTORS,
     PAPER_DESCRIPTOR,
@@ -119,6 +121,10 @@ def test_enrolled_view_keeps_its_silhouette() -> None:
     assert np.array_equal(levels, enrolled.levels[BENCH_DESCRIPTOR])
 
 
+def test_every_issue_code_has_a_text():
+    assert set(IssueCode) == set(_TEXT)
+
+
 def test_summary_counts_views_and_names_the_issues():
     found = {"box_px": [1, 2, 30, 40], "gains_bgr": [1.0, 1.1, 0.9]}
     issues = [{"code": "empty-table-differs", "agreement": 0.3}, {"code": "background-not-plain"}]
@@ -132,7 +138,7 @@ def test_summary_counts_views_and_names_the_issues():
     counted = {"empty-table-differs": 1, "background-not-plain": 1, "newer-issue": 1}
     assert summary == {"views": 3, "found": 1, "guessed": 1, "corrected": 2, "issues": counted}
     assert segmentation_words(summary) == (
-        "object found in 1 of 3 views, guessed in 1, illumination corrected in 2; empty table differs (1); background "
-        "not plain (1); newer issue (1)"
+        "object found in 1 of 3 views, guessed in 1, illumination corrected in 2; the surroundings do not look like "
+        "the empty-table image (1); the background is not plain (1); newer-issue (1)"
     )
     assert segmentation_words(segmentation_summary([None])) == ""

@@ -210,7 +210,7 @@ def metadata() -> bytes:
         return bench.state.read_file("empty-table.json") or b""
 
 
-@examples(40)
+@examples(100)
 @given(data=st.data())
 def test_any_file_content_gives_an_image_or_a_problem(metadata: bytes, data: st.DataObject) -> None:
     state = MemoryStore()
