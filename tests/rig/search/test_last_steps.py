@@ -1,6 +1,7 @@
 """The comparison with enrolled views: near twins are found or ambiguous, never confused."""
 
-from collections import defaultdict
+from argparse import Namespace
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import hbr
+from benchmarks.twins import kind_of, searches
 from hbr.dense import stopping
 from hbr.dense.pixel_fit import LocalView, PixelFit
 from rig.bench import Bench
@@ -132,3 +134,12 @@ def test_a_stop_does_not_wait_for_the_end_of_the_comparison(enrolled: tuple[Benc
     with pytest.raises(MotionStopped):
         list(identify(bench, replace(model, leader_views=stopped_meanwhile)))
     assert len(read) == 1  # not those of the second candidate
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(3600)
+def test_near_twins_are_never_confused_in_200_searches() -> None:
+    rows = searches(Namespace(searches=200, views=36, modes="dense", alone=False, seed=0, catalog=None))
+    kinds = Counter(kind_of(row) for row in rows)
+    assert kinds.keys() <= {"found", "ambiguous"}
+    assert kinds["found"] > 120
