@@ -316,6 +316,17 @@ def test_local_views_are_cut_by_the_stored_silhouettes(catalog: Catalog) -> None
     assert all(np.array_equal(one.mask, other.mask) for one, other in zip(near, again, strict=True))
 
 
+def test_one_object_without_a_description_does_not_change_the_method(catalog: Catalog) -> None:
+    before = load_model(catalog)
+    seal, _ = next(iter(rows(catalog)))
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived).where(Derived.seal == seal))
+    after = load_model(catalog)
+    assert after.descriptor == before.descriptor == BENCH_DESCRIPTOR
+    assert equal(before.views, after.views)
+    assert after.is_dense
+
+
 def test_a_changed_empty_table_image_is_found_and_not_used(catalog: Catalog) -> None:
     enrollment = complete(catalog, "box")
     image = enrollment.sessions[0].empty_table
