@@ -197,8 +197,11 @@ def strongest(posterior: FloatArray) -> Hypotheses:
     """
     weight = _peak_weights(posterior).ravel()
     count = min(_STRONGEST, len(weight))
-    best = np.argpartition(-weight, count - 1)[:count]  # of equal weights, the ones in saved runs
-    best = best[np.argsort(-weight[best], kind="stable")]
+    # Near twins have equal weights up to the last digit, which depends on where arrays lie in the memory. So weights
+    # are compared in single precision, and of equal ones the first counts.
+    rank = weight.astype(np.float32)
+    best = np.flatnonzero(rank >= np.partition(rank, -count)[-count])
+    best = best[np.argsort(-rank[best], kind="stable")][:count]
     weight = weight[best]
     place, bin_of = np.divmod(best, posterior.shape[1])
     second = int((place != place[0]).argmax())  # a decision needs two objects, even if the second one is unlikely
