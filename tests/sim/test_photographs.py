@@ -93,6 +93,16 @@ def test_enrollment_takes_each_photograph_with_its_own_angle(rig: Rig) -> None:
         np.testing.assert_allclose(image, drawn("obj1", round(azimuth_deg / 45) * 45 % 360), atol=1)
 
 
+def test_table_of_a_file_gives_objects_angles_and_the_region(rig: Rig) -> None:
+    save(Path("photographs"))
+    rows = [f"cup,{angle},photographs/obj1__{angle}.png,10 5 80 90" for angle in range(0, 360, 90)]
+    Path("views.csv").write_text("\n".join(["object,azimuth_deg,image,region", *rows]))
+    done = rig("enroll", "cup", "--yes", *put(source="views.csv"))
+    assert done.exit_code == 0, done.output
+    with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
+        assert [view.region for view in catalog.object("cup").complete.views] == [(10, 5, 80, 90)] * 4
+
+
 @pytest.mark.nightly
 def test_demo_enrolls_photographs_and_searches_in_the_others(rig: Rig) -> None:
     save(Path("photographs"), step_deg=22.5)
