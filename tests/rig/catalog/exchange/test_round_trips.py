@@ -35,6 +35,14 @@ class TestBundles:
         assert model(other) == model(full)
         assert pictures(other) == pictures(full)
 
+    def test_bundle_that_no_import_would_accept_is_not_written(
+        self, full: Catalog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("rig.catalog.exchange.bundle.MAX_DATABASE_BYTES", 1000)
+        with pytest.raises(ExportFailed, match=r"no import would accept it: .* more than 1000"):
+            write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full))
+        assert not (tmp_path / "a.rigcat.zip").exists()
+
     def test_unfinished_or_abandoned_enrollment_is_not_exported(self, full: Catalog, tmp_path: Path) -> None:
         with pytest.raises(CatalogError, match="'cup' is unfinished"):
             write_bundle(tmp_path / "a.rigcat.zip", CatalogSource(full, ["tin", "cup"]))
