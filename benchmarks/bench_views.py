@@ -24,7 +24,7 @@ from hbr.segmentation.background import SegmentedFrame, shrunk
 from hbr.segmentation.silhouette import guess_object, shares
 
 DESCRIPTORS = ("cedd", "edges+colours+cedd")
-DESCRIPTOR = "edges+colours+cedd"
+SEARCHED = ("edges+colours+cedd", "edges+colours+cedd+network")
 BENCHES = 6
 VIEWS = 4
 REPEATS = 3
@@ -79,11 +79,18 @@ def main() -> None:
     cv2.setNumThreads(1)
     for size in ((640, 480), (320, 240)):
         one_view(size)
-    kind = descriptor(DESCRIPTOR)
+    for name in SEARCHED:
+        if descriptor(name).can_describe:
+            views_of_a_search(name)
+
+
+def views_of_a_search(name: str) -> None:
+    """Measure views of searches by this descriptor."""
+    kind = descriptor(name)
     times: dict[str, list[float]] = {}
 
-    def timed(name: str, start: float) -> None:
-        times.setdefault(name, []).append(1e3 * (process_time() - start))
+    def timed(what: str, start: float) -> None:
+        times.setdefault(what, []).append(1e3 * (process_time() - start))
 
     for seed in [0, *range(BENCHES)] * REPEATS:
         images, empty = frames(seed)
@@ -92,23 +99,25 @@ def main() -> None:
             kind.describe(segment(image))
             timed(PEER, start)
         table = Background(empty)
-        for name, known, revise in (
+        for what, known, revise in (
             ("with the empty-table image", table, True),
             ("no image, at rest", None, True),
             ("no image, in motion", None, False),
         ):
-            views = ViewsTogether(DESCRIPTOR)
+            views = ViewsTogether(name)
             for n, image in enumerate(images):
                 start = process_time()
                 views.add(image, known, revise=revise)
-                timed(name, start)
-                if revise and name.startswith("no"):
+                timed(what, start)
+                if revise and what.startswith("no"):
                     timed(f"no image, view {n + 1}", start)
     peer = float(np.median(times[PEER]))
-    record(PEER, peer, PEER, peer)
-    for name, each in times.items():
-        if name != PEER:
-            record(name, float(np.mean(each)) if "view" not in name else float(np.median(each)), PEER, peer)
+    record(f"{name}: {PEER}", peer, PEER, peer)
+    for what, each in times.items():
+        if what != PEER:
+            record(
+                f"{name}: {what}", float(np.mean(each)) if "view" not in what else float(np.median(each)), PEER, peer
+            )
 
 
 if __name__ == "__main__":
