@@ -69,7 +69,7 @@ def keys(page):
 def test_day_at_the_bench_with_the_keyboard_alone(page, keys, serve_process, tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text("")
-    faults = 'bench.sim.faults=["jam@move1+5s"]'  # the first move after the first live image
+    faults = 'bench.sim.faults=["jam@move1+1s"]'  # the first move after the first live image; over before the next
     server = serve_process("bench.sim.speed=50", "enroll.views=6", faults, options=("--config", str(file)))
     page.goto(server.url)
     page.wait_for_selector("#live-image[src^='blob:']")
