@@ -97,6 +97,18 @@ def test_views_of_another_size_are_rejected() -> None:
         views.add(images[0][:200])
 
 
+def test_the_most_similar_segmentation_counts() -> None:
+    rng = np.random.default_rng(0)
+    levels = rng.integers(0, 2, (6, 512), dtype=np.uint8)
+    index = hbr.DenseIndex(hbr.Views(levels, np.arange(6) * 120.0 % 360, np.repeat([0, 1], 3), ("a", "b"), "edges"))
+    other = rng.integers(0, 2, 512, dtype=np.uint8)
+    several = hbr.update_belief(np.stack([other, levels[4]]), 0.0, index)
+    alone = hbr.update_belief(levels[4], 0.0, index)
+    assert several.ranking().object_index[0] == 1
+    # the product of one row and that of two differ in the last digits of float32 on some processors
+    assert several.scores()[1] == pytest.approx(alone.scores()[1], abs=1e-6)
+
+
 def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
     images, empty, _ = frames(2)
     alone = hbr.ViewsTogether("edges+colours+cedd")

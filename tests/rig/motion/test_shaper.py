@@ -43,9 +43,7 @@ def rate_at_end(distance_deg: float, hz: float, damping: float) -> tuple[float, 
     return float(np.abs(rates).max()), plan.seconds + plan.rings_s - motion_seconds(distance_deg, USUAL)
 
 
-# The documentation states the rest of moves of up to 180 degrees. On a well damped table a shaped move wins nothing,
-# and of the few speeds and accelerations that are compared, the best for a longer one can be 0.02 s slower.
-@given(st.floats(2.0, 180.0), st.floats(6.0, 20.0), st.floats(0.02, 0.2))
+@given(st.floats(2.0, 300.0), st.floats(6.0, 20.0), st.floats(0.02, 0.2))
 @examples(60)
 def test_shaped_motion_is_at_rest_before_a_usual_one_rings_down(distance_deg, hz, damping):
     rate_dps, later_s = rate_at_end(distance_deg, hz, damping)
@@ -53,7 +51,7 @@ def test_shaped_motion_is_at_rest_before_a_usual_one_rings_down(distance_deg, hz
     omega = 2 * np.pi * hz
     quiet_dps = QUIET_SHARE * TableConfig().quiet_dps
     rings_s = np.log(2 * USUAL.acceleration_dps2 / omega / quiet_dps) / (damping * omega)
-    assert later_s < rings_s / 2 + 0.13
+    assert later_s < rings_s / 2 + 0.12
 
 
 @given(st.floats(0.06, 1.0), st.floats(3.0, 300.0), st.sampled_from((6.0, 20.0)))
