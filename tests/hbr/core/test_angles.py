@@ -47,3 +47,10 @@ def test_arrays_return_arrays_and_floats_return_floats() -> None:
     assert wrap180(angles).tolist() == [-90.0, 10.0]
     assert revolutions_between(angles, 0.0).tolist() == [0.25, 10 / 360]
     assert type(wrap360(1.0)) is type(wrap180(1.0)) is type(revolutions_between(1.0, 2.0)) is float
+
+
+@given(st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_size=1, max_size=20))
+def test_arrays_and_numbers_have_equal_distances(pairs: list[tuple[float, float]]) -> None:
+    a, b = np.array(pairs).T
+    expected = [revolutions_between(x, y) for x, y in pairs]
+    assert revolutions_between(a, b) == pytest.approx(np.array(expected), abs=1e-9)

@@ -60,6 +60,15 @@ def test_spacing_of_the_views_and_number_of_queries_count_within_those_of_the_fi
         assert np.exp(found[[APART, QUERIES]]) == pytest.approx([max(step_deg, 10.0), min(count, 4)])
 
 
+def test_the_second_object_has_a_negative_margin() -> None:
+    index = DenseIndex(catalog(10))
+    belief = belief_after([view(index.views, 2, deg) for deg in QUERIES_DEG], QUERIES_DEG, index)
+    order = np.argsort(-belief.support.max(axis=1))
+    first, second = (numbers(belief, int(place)) for place in order[:2])
+    assert first[SECOND] > 0 > second[SECOND]
+    assert first[LEAD] > second[LEAD]
+
+
 def test_one_object_alone_is_compared_with_nothing() -> None:
     index = DenseIndex(catalog(1))
     found = search(index, 0.0, j=0)

@@ -12,6 +12,7 @@ from hbr import DenseIndex, Views, update_belief
 from hbr.core.angles import size_deg
 from hbr.dense.filter import BETA, Belief
 from hbr.dense.index import BINS, OMEGA
+from hbr.dense.pose import azimuth_of
 from hbr.kernels import without_library
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import belief_after
@@ -123,6 +124,24 @@ def test_left_out_view_does_not_count() -> None:
     assert update_belief(query, 0.0, index).scores()[1] == pytest.approx(1, abs=1e-4)
     with pytest.raises(ValueError, match="without any view"):
         index.without(views.of(2))
+
+
+def test_rotated_queries_agree_on_an_azimuth_between_the_bins() -> None:
+    views = catalog(7, ragged=False)
+    rows = views.of(2)
+    belief = belief_after(views.descriptors[rows[[1, 3, 6]]], [10.0, 100.0, 235.0], DenseIndex(views))
+    ranking = belief.ranking()
+    assert ranking.object_index[0] == 2
+    assert abs((azimuth_of(belief, 2) - views.azimuth_deg[rows[6]] + 180) % 360 - 180) < 2.5
+
+
+def test_another_zero_of_the_orientations_changes_nothing() -> None:
+    views = catalog(9)
+    queries = catalog(10, ragged=False).descriptors[:3]
+    index = DenseIndex(views)
+    one = belief_after(queries, [0.0, 40.0, 170.0], index)
+    other = belief_after(queries, [-300.0, -260.0, 230.0], index)
+    np.testing.assert_allclose(one.support, other.support, atol=1e-4)
 
 
 def test_invalid_query_is_rejected() -> None:

@@ -9,7 +9,6 @@ from hbr import DenseIndex, Views, update_belief
 from hbr.core.angles import wrap180
 from hbr.dense.pose import Pose, azimuth_of, pose, pose_of
 from tests.hbr.dense.searches import belief_after, catalog
-from tests.hbr.model.test_symmetry import ring
 
 AZIMUTHS_DEG = np.arange(360.0)
 #: Of no other azimuth.
@@ -52,6 +51,13 @@ def test_unequal_parts_are_no_symmetry() -> None:
 def among_others(views: Views) -> DenseIndex:
     """Return an index of an object, and others that change as much: they show what distinguishes views of one."""
     return DenseIndex(Views.concatenate([views, catalog(8, kind="cedd")]))
+
+
+def ring(period: int, seed: int) -> np.ndarray:
+    """Return descriptors, uint8 (36, 144), that change smoothly around an object and repeat after ``period`` views."""
+    keys = np.random.default_rng(seed).integers(0, 8, (period, 144)).astype(float)
+    smooth = sum(np.roll(keys, shift, axis=0) for shift in range(-3, 4)) / 7
+    return np.tile(np.rint(smooth).astype(np.uint8), (36 // period, 1))
 
 
 @pytest.mark.parametrize(("period", "period_deg"), [(36, 360.0), (18, 180.0), (1, 0.0)])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hbr import DenseIndex, DenseSession, Outcome
+from hbr.dense.filter import update_belief
 from tests.hbr.dense.searches import belief_after, catalog, found_from, view
 
 QUERIES_DEG = (0.0, 100.0, 220.0)
@@ -100,3 +101,11 @@ def test_a_search_does_not_end_by_views_that_were_not_segmented_reliably(index: 
     query = view(index.views, 3, 0.0)
     assert DenseSession(index).add(query, 0.0, reliable=False).outcome is Outcome.CONTINUE
     assert DenseSession(index, max_views=1).add(query, 0.0, reliable=False).outcome is Outcome.FOUND
+
+
+def test_the_next_view_is_that_of_the_belief(index: DenseIndex) -> None:
+    session = searched(DenseSession(index), [view(index.views, 3, 0.0)])
+    chosen = session.next_best_view([-90.0, 45.0, 120.0], [1.0, 0.5, 1.3])
+    assert chosen.rotation_deg in (-90.0, 45.0, 120.0)
+    belief = update_belief(view(index.views, 3, 0.0), 0.0, index)
+    np.testing.assert_array_equal(session.belief.posterior, belief.posterior)

@@ -96,14 +96,21 @@ def test_a_search_between_both_is_ambiguous_only_after_its_last_view() -> None:
     assert (end.outcome, end.reason) == (Outcome.AMBIGUOUS, StopReason.MAX_VIEWS)
 
 
+def test_two_equal_objects_share_the_probability() -> None:
+    views = catalog(6)
+    own = views.of(2)
+    twin = type(views).of_object("twin", views.levels(own), views.azimuth_deg[own], views.descriptor)
+    index = DenseIndex(type(views).concatenate([views, twin]))
+    probability, _ = posterior(search(0.0, index=index))
+    assert probability[2] == pytest.approx(probability[6], rel=1e-3)
+    assert decide(search(0.0, index=index), last=True).outcome is not Outcome.FOUND
+
+
 def test_the_better_fit_leads_among_twins() -> None:
     views = catalog(6)
     own = views.of(2)
     twin = type(views).of_object("twin", views.levels(own), views.azimuth_deg[own], views.descriptor)
     belief = search(0.0, index=DenseIndex(type(views).concatenate([views, twin])))
-    probability, _ = posterior(belief)
-    assert probability[2] == pytest.approx(probability[6], rel=1e-3)
-    assert decide(belief, last=True).outcome is not Outcome.FOUND  # they share the probability
     for leader, other in ((2, 6), (6, 2)):
         shares = [
             among_enrolled(belief, fitted(leader, 0.6 + by, second=0.6, others=0.2, expected=0.6))

@@ -106,19 +106,14 @@ def test_areas_with_a_whole_mean_round_like_the_reference() -> None:
     assert found.tolist() == expected
 
 
-DRAWINGS = (
-    *("flat", "two halves", "gradient", "stripes as wide as a quarter", "chequers", "one dot"),
-    "same sums, other pixels",
-)
-
-
 def drawing(name: str, height: int, width: int) -> Image:
     """Return greys with mostly integer sums, and many equal quarters of blocks."""
     y, x = np.mgrid[:height, :width]
     grey = {
         "flat": 127 + 0 * x,
         "two halves": np.where(x < width // 2, 118, 241),
-        "gradient": x * 255 // width,
+        "gradient along x": x * 255 // width,
+        "gradient along y": y * 255 // height,
         "stripes as wide as a quarter": np.where(x // (width // 80) % 2, 57, 228),
         "chequers": (x // 5 + y // 5) % 2 * 100 + 27,
         "one dot": 205 + (x == width // 3) * (y == height // 3),
@@ -127,8 +122,17 @@ def drawing(name: str, height: int, width: int) -> Image:
     return np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
 
 
-@pytest.mark.parametrize("name", DRAWINGS)
-@pytest.mark.parametrize(("height", "width"), [(160, 240), (203, 170)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("flat", "two halves", "gradient along x", "gradient along y", "stripes as wide as a quarter"),
+        *("chequers", "one dot", "same sums, other pixels"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("height", "width"),
+    [(160, 240), (203, 170), *(pytest.param(n, n, marks=pytest.mark.nightly) for n in (80, 320))],
+)
 def test_areas_of_drawings_round_like_the_reference(name: str, height: int, width: int) -> None:
     image = drawing(name, height, width)
     y, x = height // 80, width // 80
@@ -201,10 +205,15 @@ def test_pixels_outside_the_grid_are_ignored() -> None:
 )
 def test_memory_layout_does_not_matter(view: Callable[[Image], Image]) -> None:
     image = noise(200, 260) // 64 * 64
+    assert (cedd(view(image)) == cedd(np.ascontiguousarray(view(image)))).all()
+
+
+def test_image_is_not_changed() -> None:
+    image = noise(130, 90)
     before = image.copy()
     image.flags.writeable = False
-    assert (cedd(view(image)) == cedd(np.ascontiguousarray(view(image)))).all()
-    describe(view(image))
+    cedd(image)
+    describe(image)
     assert (image == before).all()
 
 
@@ -245,3 +254,14 @@ def test_describe_scales_to_covered_sides(size: tuple[int, int], brought_to: tup
     assert covered(image).shape == (brought_to[1], brought_to[0], 3)
     same = noise(480, 640)
     assert (describe(same) == cedd(same)).all()
+
+
+@examples(9)
+@given(st.integers(1, 2000), st.integers(1, 2000))
+def test_scaled_sides_are_covered_and_close(width: int, height: int) -> None:
+    size = _covered_size(width, height)
+    scale = min(1.0, 640 / max(width, height))
+    for side, result in zip((width, height), size, strict=True):
+        assert result % 80 == 0
+        assert 80 <= result <= 640
+        assert abs(result - side * scale) <= 40 or result == 80

@@ -48,3 +48,8 @@ def test_wrong_number_of_bytes_is_rejected(count: int) -> None:
         unpack(bytes(count))
     with pytest.raises(ValueError, match="109 bytes are no multiple of 54"):
         unpack_rows(bytes(109))
+
+
+@given(arrays(np.uint8, st.tuples(st.integers(0, 5), st.just(144)), elements=st.integers(0, 7)))
+def test_joined_descriptors_unpack_like_single_ones(levels: np.ndarray) -> None:
+    assert np.array_equal(unpack_rows(b"".join(pack(row) for row in levels)), levels)

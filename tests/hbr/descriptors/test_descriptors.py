@@ -94,6 +94,16 @@ def test_name_of_a_descriptor_is_checked_and_opens_no_file(monkeypatch: pytest.M
             descriptor(name)
 
 
+def test_blur_of_a_block_makes_cedd_robust_to_noise() -> None:
+    rng = np.random.default_rng(0)
+    noisy = np.clip(photo() + rng.normal(0, 25, (120, 160, 3)), 0, 255).astype(np.uint8)
+    same = {
+        name: descriptor(name).similarity(*(descriptor(name).describe(i)[None] for i in (photo(), noisy)))[0, 0]
+        for name in ("cedd", "cedd-blurred")
+    }
+    assert same["cedd-blurred"] > 0.8 > 0.5 > same["cedd"]
+
+
 def test_views_of_different_descriptors_cannot_be_mixed() -> None:
     views = [Views.of_object("a", descriptor(n).describe(photo())[None], [0.0], n) for n in ("cedd", "edges")]
     with pytest.raises(ValueError, match="views of cedd and edges cannot be compared"):
@@ -144,6 +154,12 @@ def test_edges_are_bits_of_the_strong_entries() -> None:
         descriptor("edges").pack(levels + levels)
 
 
+def test_an_object_without_edges_is_not_similar_to_any() -> None:
+    kind = descriptor("edges")
+    rows = np.stack([kind.describe(np.full((120, 160, 3), 90, np.uint8)), kind.describe(photo())])
+    np.testing.assert_allclose(kind.similarity(rows, rows), [[0, 0], [0, 1]])
+
+
 @pytest.mark.parametrize("spread", [1, 20, 300])
 def test_colours_are_compared_by_a_gaussian_kernel(spread: int) -> None:
     kind, rng = descriptor("colours"), np.random.default_rng(0)
@@ -174,8 +190,11 @@ def test_best_descriptor_uses_the_network_where_it_is_installed(monkeypatch: pyt
     assert best() == LIGHT
 
 
-def test_descriptors_with_weights_describe_a_view_as_each_does_alone() -> None:
+def test_one_descriptor_with_weight_1_is_that_descriptor() -> None:
     assert descriptor("cedd=1") is descriptor("cedd")
+
+
+def test_descriptors_with_weights_describe_a_view_as_each_does_alone() -> None:
     both = descriptor("cedd=0.25,edges+colours+cedd=0.75")
     parts = [descriptor(name) for name in ("cedd", "edges+colours+cedd")]
     images = [photo(seed) for seed in range(4)]
@@ -217,6 +236,19 @@ def test_rotated_cedd_takes_the_most_similar_rotation() -> None:
     among = kind.prepared(b).among(groups)
     for rows, similar in zip(groups, among, strict=True):
         np.testing.assert_allclose(similar, kind.similarity(b[rows], b[rows]), atol=1e-12)
+
+
+def stripes(angle_deg: float) -> np.ndarray:
+    """Return stripes of two colours along a direction, counter-clockwise from the right."""
+    y, x = np.indices((480, 480))
+    across = x * np.sin(np.radians(angle_deg)) + y * np.cos(np.radians(angle_deg))
+    return np.where((across // 27 % 2 == 0)[:, :, None], [40, 40, 200], [200, 120, 40]).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("angle_deg", "texture"), [(0, 2), (45, 4), (90, 3), (135, 5)])
+def test_a_rotation_moves_edges_to_the_next_class(angle_deg: float, texture: int) -> None:
+    levels = descriptor("cedd-rotated").describe(stripes(angle_deg)).reshape(6, 24).sum(axis=1)
+    assert 2 + levels[2:].argmax() == texture
 
 
 def test_an_image_that_is_rotated_by_90_degrees_is_the_same_for_rotated_cedd() -> None:

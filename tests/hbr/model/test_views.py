@@ -16,6 +16,10 @@ def make(**changed: Any) -> Views:
     return Views(**(columns | changed))
 
 
+def test_azimuths_are_wrapped() -> None:
+    assert make(azimuth_deg=np.array([-5.0, 360.0, 725.0])).azimuth_deg.tolist() == [355.0, 0.0, 5.0]
+
+
 def test_arrays_are_read_only_inside_and_writeable_outside() -> None:
     descriptors = np.zeros((3, 144), np.uint8)
     views = make(descriptors=descriptors)
@@ -25,17 +29,16 @@ def test_arrays_are_read_only_inside_and_writeable_outside() -> None:
     descriptors[0] = 1
 
 
-def test_views_of_an_object_are_found_and_selected() -> None:
-    assert make(azimuth_deg=np.array([-5.0, 360.0, 725.0])).azimuth_deg.tolist() == [355.0, 0.0, 5.0]
-    assert make(object_names=("cup", "duck", "fox")).of(2).tolist() == []
+def test_views_of_an_object_are_found() -> None:
     views = make()
-    selected = views.select(np.array([False, True, False]))
-    assert selected.object_names == ("cup", "duck")
-    assert (selected.object_index.tolist(), selected.azimuth_deg.tolist()) == ([0], [90])
     assert views.of(0).tolist() == [1]
     assert views.of(1).tolist() == [0, 2]
     rows, begin = views.of_each(np.array([1, 0]))
     assert (rows.tolist(), begin.tolist()) == ([0, 2, 1], [0, 2])
+
+
+def test_object_may_have_no_views() -> None:
+    assert make(object_names=("cup", "duck", "fox")).of(2).tolist() == []
 
 
 def test_concatenation_merges_objects_of_the_same_name() -> None:
@@ -47,8 +50,18 @@ def test_concatenation_merges_objects_of_the_same_name() -> None:
     assert joined.azimuth_deg.tolist() == [0, 90, 355, 20, 10, 350]
     assert (joined.descriptors[:3] == make().descriptors).all()
     assert (joined.descriptors[4:] == 7).all()
+
+
+def test_concatenation_of_nothing_is_empty() -> None:
     assert len(Views.concatenate([])) == len(Views.empty()) == 0
     assert Views.concatenate([Views.empty(), make()]).object_names == ("cup", "duck")
+
+
+def test_selection_keeps_the_objects() -> None:
+    selected = make().select(np.array([False, True, False]))
+    assert selected.object_names == ("cup", "duck")
+    assert selected.object_index.tolist() == [0]
+    assert selected.azimuth_deg.tolist() == [90]
 
 
 @pytest.mark.parametrize(

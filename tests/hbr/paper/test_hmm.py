@@ -58,6 +58,29 @@ def test_belief_is_the_sum_over_all_paths(counts, queries, sigma_deg):
     assert (np.diff(log_object) <= 0).all()
 
 
+def test_a_rotation_of_all_angles_changes_nothing():
+    views, rng = shelf(6, 6, 5), np.random.default_rng(3)
+    similar, orientation_deg = rng.random((3, len(views))), np.array([0.0, 80.0, -35.0])
+    rotated = hbr.Views.concatenate(
+        [
+            hbr.Views.of_object(name, views.descriptors[views.of(j)], (views.azimuth_deg[views.of(j)] + 77) % 360)
+            for j, name in enumerate(views.object_names)
+        ]
+    )
+    one = pose_belief(similar, orientation_deg, views)
+    for zero_deg, known in ((123.0, views), (0.0, rotated)):
+        other = pose_belief(similar, orientation_deg + zero_deg, known)
+        np.testing.assert_allclose(other.log_state, one.log_state, atol=1e-6)
+        assert other.next_view().rotation_deg == one.next_view().rotation_deg
+
+
+def test_small_errors_and_impossible_rotations_stay_finite():
+    views = shelf(3, 2)
+    belief = pose_belief(np.zeros((3, 5)), [0, 180, 10], views, sigma_deg=0.01, temperature=1e-3)
+    assert np.isfinite(belief.log_state).all()
+    assert np.exp(belief.log_state).sum() == pytest.approx(1)
+
+
 def test_next_view_is_where_twins_differ():
     azimuth_deg = np.arange(0, 360, 30.0)
     first = np.random.default_rng(4).integers(0, 8, (12, 144), np.uint8)

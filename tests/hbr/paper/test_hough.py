@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hbr import Extension, ViewIndex, Views, retrieve
 from tests.fuzzing import examples
-from tests.hbr.paper.retrieval_reference import SEVERAL, Enumeration, similarity, similarity_of_several
+from tests.hbr.paper.retrieval_reference import SEVERAL, Enumeration, similarity_of_several
 
 EXTENSIONS = get_args(Extension)
 
@@ -19,47 +19,37 @@ def one_hot(*levels: tuple[int, int]) -> np.ndarray:
     return row
 
 
-Case = tuple[np.ndarray, list[float], Views, float, int]
-
-
 @st.composite
-def small_cases(draw: st.DrawFn) -> Case:
-    """Draw model sets with few bins and levels, so that similarities are equal; azimuths are regular or not.
-
-    The views have one descriptor, or two that add up with their weights.
-    """
+def small_cases(draw: st.DrawFn) -> tuple[np.ndarray, list[float], Views, float, int]:
+    """Draw model sets with few bins and levels, so that similarities are equal; azimuths are regular or not."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count = draw(st.integers(1, 14))
     steps = draw(st.integers(1, 4))
     objects = draw(st.integers(1, 4))
     bins, top = draw(st.integers(1, 6)), draw(st.sampled_from([1, 7]))
 
-    kind = draw(st.sampled_from(["cedd", "cedd", SEVERAL]))
-
     def rows(n: int) -> np.ndarray:
         descriptors = np.zeros((n, 144), np.uint8)
         descriptors[:, :bins] = rng.integers(0, top + 1, (n, bins))
-        if kind == "cedd":
-            return descriptors
-        return np.concatenate([descriptors, rng.integers(0, 8, descriptors.shape, np.uint8)], axis=1)
+        return descriptors
 
     # multiples of an eighth of a degree: differences are exact, so that ties of the reference are ties
     azimuth = (5 * rng.integers(0, 72, count)).astype(np.float64)
     if draw(st.booleans()):
         azimuth = rng.integers(0, 2880, count) / 8.0
-    views = Views(rows(count), azimuth, rng.integers(0, objects, count), tuple("abcd"[:objects]), kind)
+    views = Views(rows(count), azimuth, rng.integers(0, objects, count), tuple("abcd"[:objects]))
     orientations = (rng.integers(-2880, 2880, steps) / 8).tolist()
     return rows(steps), orientations, views, draw(st.sampled_from([0.0, 0.5, 2.0])), draw(st.integers(1, 5))
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
 @examples(17)
-@given(small_cases(), st.integers(-720, 720))
-def test_equals_the_enumeration_of_all_paths(extension: Extension, case: Case, zero_deg: int) -> None:
+@given(small_cases())
+def test_equals_the_enumeration_of_all_paths(
+    extension: Extension, case: tuple[np.ndarray, list[float], Views, float, int]
+) -> None:
     queries, orientations, views, omega, length = case
-    alike = similarity if views.descriptor == "cedd" else similarity_of_several
-    expected = Enumeration(queries, orientations, views, omega, length, extension, alike)
-    orientations = np.add(orientations, zero_deg).tolist()  # the zero of the orientations does not matter
+    expected = Enumeration(queries, orientations, views, omega, length, extension)
     ranking = retrieve(queries, orientations, ViewIndex(views), omega=omega, list_length=length, extension=extension)
     assert [rows.tolist() for rows in ranking.lists] == expected.lists
     assert sorted(ranking.object_index.tolist()) == expected.candidates
@@ -72,6 +62,40 @@ def test_equals_the_enumeration_of_all_paths(extension: Extension, case: Case, z
         assert pose == views.azimuth_deg[path[-1]]
     order = list(zip(-ranking.scores, ranking.object_index, strict=True))
     assert order == sorted(order)
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+@examples(5)
+@given(small_cases(), st.integers(0, 2**32 - 1))
+def test_several_descriptors_add_up_with_their_weights(
+    extension: Extension, case: tuple[np.ndarray, list[float], Views, float, int], seed: int
+) -> None:
+    first_queries, orientations, first, omega, length = case
+    rng = np.random.default_rng(seed)
+
+    def both(levels: np.ndarray) -> np.ndarray:
+        return np.concatenate([levels, rng.integers(0, 8, levels.shape, np.uint8)], axis=1)
+
+    views = Views(both(first.descriptors), first.azimuth_deg, first.object_index, first.object_names, SEVERAL)
+    queries = both(first_queries)
+    expected = Enumeration(queries, orientations, views, omega, length, extension, similarity_of_several)
+    ranking = retrieve(queries, orientations, ViewIndex(views), omega=omega, list_length=length, extension=extension)
+    scores = dict(zip(ranking.object_index.tolist(), ranking.scores.tolist(), strict=True))
+    assert scores == pytest.approx(expected.scores, abs=1e-12)
+
+
+@examples(6)
+@given(small_cases(), st.integers(-720, 720))
+def test_zero_of_the_orientations_does_not_matter(
+    case: tuple[np.ndarray, list[float], Views, float, int], zero_deg: int
+) -> None:
+    queries, orientations, views, omega, length = case
+    index = ViewIndex(views)
+    plain = retrieve(queries, orientations, index, omega=omega, list_length=length)
+    shifted = retrieve(queries, np.add(orientations, zero_deg), index, omega=omega, list_length=length)
+    assert shifted.object_index.tolist() == plain.object_index.tolist()
+    assert shifted.scores == pytest.approx(plain.scores, abs=1e-12)
+    assert shifted.paths.tolist() == plain.paths.tolist()
 
 
 # Two objects for the examples by hand. Query 1 is seen at 0 degrees, query 2 at 90.

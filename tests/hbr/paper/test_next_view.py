@@ -80,11 +80,12 @@ def test_decision_is_the_side_on_which_the_candidates_differ() -> None:
     assert decision.orientation_deg == 315.0
     decision = next_view(pair(similar_on_left=False))
     assert (decision.side, decision.rotation_deg) == ("left", 45.0)
-    equal = next_view(pair(similar_on_left=True, pose_deg=90.0, orientations=(0.0, 90.0)))
-    assert equal.s_left == equal.s_right == 1.0  # 90 lies between two sectors that look the same
-    assert (equal.side, equal.rotation_deg) == ("left", 45.0)
-    detour = next_view(pair(similar_on_left=True, orientations=(-45.0, 0.0)))  # stays on its side
-    assert (detour.side, detour.rotation_deg, detour.orientation_deg) == ("right", -135.0, 225.0)
+
+
+def test_equal_sides_give_left() -> None:
+    decision = next_view(pair(similar_on_left=True, pose_deg=90.0, orientations=(0.0, 90.0)))
+    assert decision.s_left == decision.s_right == 1.0  # 90 lies between two sectors that look the same
+    assert (decision.side, decision.rotation_deg) == ("left", 45.0)
 
 
 @pytest.mark.parametrize(("pose_deg", "rotation_deg"), [(45.0, 90.0), (50.0, 85.0), (40.0, 95.0), (355.0, 50.0)])
@@ -109,6 +110,11 @@ def test_rotation_ends_at_the_next_sector_centre(pose_deg: float, rotation_deg: 
 def test_visited_orientations_are_avoided(visited: tuple[float, ...], rotation_deg: float, detour_deg: float) -> None:
     decision = next_view(pair(similar_on_left=False, orientations=(*visited, 0.0)))
     assert (decision.rotation_deg, decision.detour_deg) == (rotation_deg, detour_deg)
+
+
+def test_detour_stays_on_its_side() -> None:
+    decision = next_view(pair(similar_on_left=True, orientations=(-45.0, 0.0)))
+    assert (decision.side, decision.rotation_deg, decision.orientation_deg) == ("right", -135.0, 225.0)
 
 
 def test_catalog_of_one_object_gives_left() -> None:
@@ -146,6 +152,11 @@ def test_rotation_ends_at_a_centre_of_the_sectors(sectors: int) -> None:
         ends_deg = ranking.pose_deg[0] + decision.rotation_deg
         assert (ends_deg / width_deg) % 1 == pytest.approx(0.5)
         assert 0 < abs(decision.rotation_deg) - decision.detour_deg <= width_deg
-    for impossible in (1, 17):
-        with pytest.raises(ValueError, match="2 to 16"):
-            next_view(ranking, sectors=impossible)
+
+
+@pytest.mark.parametrize("sectors", [1, 17])
+def test_impossible_numbers_of_sectors_are_rejected(sectors: int) -> None:
+    views = Views.of_object("one", np.ones((8, 144), np.uint8), np.arange(8) * 45.0)
+    ranking = retrieve(np.ones((2, 144), np.uint8), [0.0, 90.0], ViewIndex(views))
+    with pytest.raises(ValueError, match="2 to 16"):
+        next_view(ranking, sectors=sectors)

@@ -39,6 +39,11 @@ def test_threshold_is_independent_of_the_order_and_separate_for_objects():
     assert hbr.open_set_threshold(both) == pytest.approx(expected)
 
 
+def test_coarser_enrollment_has_a_lower_threshold():
+    fine = ring(3, 72, 8)
+    assert hbr.open_set_threshold(fine.select(np.arange(0, 72, 6))) < hbr.open_set_threshold(fine)
+
+
 def test_too_few_views_give_0():
     assert hbr.open_set_threshold(ring(4, 3, 5)) == 0.0
     assert hbr.open_set_threshold(hbr.Views.empty()) == 0.0
