@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hbr.dense import stopping
 from hbr.segmentation import BoxMethod
 from rig.catalog import Catalog, derived
 from rig.catalog.describing import described
@@ -110,3 +111,22 @@ def test_pan_servo_goes_to_its_nearest_limit(simulated) -> None:
         assert table.within_reach(-170.0) == -150.0
         assert table.within_reach(160.0) == 150.0
         assert table.within_reach(250.0) == -110.0
+
+
+@pytest.mark.nightly
+def test_search_by_an_orbiting_camera_goes_where_an_image_was_taken(
+    simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search weighs rotations of 5 degrees; with an image each 30 degrees it takes no view between them."""
+    s = simulated(*ARM)
+    with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
+        list(photograph_table(s.bench, views=12))
+        for name in ("mug-star", "mug-white"):
+            list(enroll(s.bench, catalog, name, views=6))
+        for limit in ("MIN_CONFIDENCE", "HOPELESS"):
+            monkeypatch.setattr(stopping, limit, 2.0)  # so that the search takes all its views
+        s.operator.next_object, s.operator.yaw_deg = "mug-white", 100.0
+        views = [e for e in identify(s.bench, load_model(catalog)) if isinstance(e, Accepted)]
+    assert len(views) > 1
+    assert all(abs((view.azimuth_deg + 15) % 30 - 15) < 1 for view in views)
+    assert {view.segmentation["method"] for view in views} == {BoxMethod.EMPTY_TABLE}

@@ -286,3 +286,17 @@ def test_interrupted_motion_must_be_acknowledged():
         bench.safety.acknowledge()
         with table:
             assert table.goto(20.0).agrees
+
+
+def test_backlash_is_visible_without_approach():
+    """Without the approach, the backlash is visible: the test above would fail."""
+    noise = NoiseModel(backlash_deg=2.0)
+    with (
+        motion_bench("table.approach_deg=0", "table.backlash_deg=3", noise=noise) as (bench, wires),
+        Turntable(bench) as table,
+    ):
+        table.goto(50.0)
+        from_below = wires.world.table_deg()
+        table.goto(100.0)
+        table.goto(50.0)
+        assert abs(wires.world.table_deg() - from_below) > 1.5
