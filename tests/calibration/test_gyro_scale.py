@@ -52,14 +52,16 @@ def torque(s) -> int:
     return s.bench.servo._read("Torque Enable")
 
 
-@pytest.mark.nightly
-def test_true_scale_lies_within_the_stated_uncertainty(simulated):
+@pytest.mark.parametrize("benches", [3, pytest.param(20, marks=pytest.mark.nightly)])
+def test_true_scale_lies_within_the_stated_uncertainty(simulated, benches):
     """The simulated servo rests in the middle of its counts, a real one anywhere: the errors may be the smaller."""
     z = []
-    for seed in range(20):
+    for seed in range(benches):
         result = run(simulated(seed=seed))
         assert result.passed, result.rejections
         assert result.estimates["scale"].value == pytest.approx(true_scale(seed), rel=0.001)
+        assert result.residual < result.limit
+        assert result.estimates["scale"].uncertainty < 1.5e-4
         z += in_sigmas(result, scale=true_scale(seed))
     assert np.mean(np.abs(z) < 1.96) >= 0.85
     assert 0.3 < sqrt(np.mean(np.square(z))) < 1.3

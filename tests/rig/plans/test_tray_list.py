@@ -152,3 +152,24 @@ def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
     with pytest.raises(ObjectNotFound):
         list(enroll_tray(s.bench, catalog, items("nonsense"), views=4))
     assert {NoObject, ViewRejected, RotationDisagreement, ObjectNotFound} == set(OBJECT_ERRORS)
+
+
+def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, catalog):
+    s = simulated()
+
+    class Lights(Scripted):
+        def choose(self, question):
+            if question.subject is Subject.FAILURE:
+                s.world.change(light=(1.0, 1.0, 1.0))
+            return super().choose(question)
+
+    operator = Lights(problem=[Choice.CONTINUE])
+    events = []
+    for event in enroll_tray(s.bench, catalog, items("dice"), views=4, operator=operator):
+        if isinstance(event, Accepted) and not any(isinstance(earlier, Accepted) for earlier in events):
+            s.world.change(light=(0.0, 0.0, 0.0))
+        events.append(event)
+    (failure,) = operator.troubles
+    assert failure.startswith("dice: View 2 was rejected")
+    assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
+    assert catalog.object("dice").summary.views == 4
