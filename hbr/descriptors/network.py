@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.similarity import RootCosine
+from hbr.kernels import calls
 from hbr.kernels.nets import Floats, Net, SharedNet
 from hbr.segmentation import Segmentation
 
@@ -140,8 +141,11 @@ def features(image_bgr: ImageArray) -> Floats:
     height, width = image_bgr.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
-    method = cv2.INTER_AREA if side > _SIDE_PX else cv2.INTER_LINEAR
-    middle = cv2.resize(image_bgr[top : top + side, left : left + side], (_SIDE_PX, _SIDE_PX), interpolation=method)
+    square = image_bgr[top : top + side, left : left + side]
+    middle = calls.average(square, _SIDE_PX)
+    if middle is None:  # no kernel, or the square grows, or nothing changes
+        method = cv2.INTER_AREA if side > _SIDE_PX else cv2.INTER_LINEAR
+        middle = cv2.resize(square, (_SIDE_PX, _SIDE_PX), interpolation=method).astype(np.uint8, copy=False)
     layer = _NET((middle[:, :, ::-1].astype(np.float32) - np.float32(_MEAN)) * np.float32(1 / _RANGE))
     share = _shares(layer.shape[0])
     cells: Floats = np.einsum("ai,ijc,bj->abc", share, layer, share, optimize=True)
