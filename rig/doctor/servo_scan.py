@@ -36,6 +36,7 @@ _LISTEN_S = 0.05  # longer than an answer at the lowest rate; only a device that
 _SETTLE_S = 0.05  # time that a servo needs before it answers at a new rate
 # two servos with one id collide in most readings, a bad cable in few: more than half of these tells them apart
 _STATUS_READS = 8
+_MOST_DUPLICATE_IDS = 4  # if more ids collide, an adapter or a loose contact adds bytes after each request
 _STATUS, _STATUS_SIZE = "Realtime Tick", 27  # to Present Temperature: servos with the same id soon differ in these
 
 
@@ -125,6 +126,8 @@ def _scan(port: ClockedPort, baud: int) -> BaudScan:
     # came than belong to complete answers, ask each id separately.
     rest = len(listening.answered) - _PING_ANSWER * len(answers)
     for bus_id in (bus_id for bus_id in range(MAX_ID + 1) if rest and bus_id not in answers):
+        if len(duplicate_ids) > _MOST_DUPLICATE_IDS:
+            break
         corrupt = bus.statistics.corrupt
         try:
             head = bus.read_block(bus_id, 0, 7)
@@ -135,6 +138,8 @@ def _scan(port: ClockedPort, baud: int) -> BaudScan:
             number = int.from_bytes(head[:2], "little")
             servos.append(FoundServo(bus_id, baud, model_of(number), number, head[6]))
     sound = tuple(servo for servo in servos if servo.bus_id not in duplicate_ids)
+    if len(duplicate_ids) > _MOST_DUPLICATE_IDS:
+        return BaudScan(baud, sound, noise=True)
     return BaudScan(baud, sound, tuple(sorted(duplicate_ids)), bool(rest) and not duplicate_ids and not sound)
 
 

@@ -82,6 +82,27 @@ def test_babbling_bus_is_noise_and_an_echo_changes_nothing(fault, ids, noise, be
     assert not said.duplicate_ids
 
 
+def test_bytes_after_each_request_are_noise_and_the_scan_stays_short(bench):
+    class Glitch(type(bench.devices.adapter)):
+        """An adapter that adds a byte when it begins to receive."""
+
+        def write(self, data):
+            super().reset_input_buffer()
+            self.added = b"\0"
+            return super().write(data)
+
+        def read(self, size=1):
+            added, self.added = getattr(self, "added", b""), b""
+            return added or super().read(size)
+
+    bench.devices.adapter.__class__ = Glitch
+    (said,) = heard(bench, 57_600)
+    assert [servo.bus_id for servo in said.servos] == [1]
+    assert said.noise
+    assert not said.duplicate_ids
+    assert bench.context.computer.clock.now_ns() < 10e9  # each of eight rates takes no longer
+
+
 def test_servo_with_a_corrupt_answer_is_asked_again(bench):
     spoiled = []
 
