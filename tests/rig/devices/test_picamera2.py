@@ -215,6 +215,8 @@ def test_sensor_on_the_ribbon_cable_is_recognised_and_not_opened(receiver, monke
             "pip install --ignore-installed --no-deps simplejpeg",
         ),
         ("raise OSError('libcamera.so: no file')", "OSError: libcamera.so: no file", "apt install --reinstall"),
+        ("raise RuntimeError('no manager')", "RuntimeError: no manager", "apt install --reinstall"),
+        ("raise ImportError('DLL load failed')", "ImportError: DLL load failed", "apt install --reinstall"),
         ("import no_libcamera", "No module named 'no_libcamera'", "apt install -y python3-picamera2"),
     ],
 )
