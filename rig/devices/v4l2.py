@@ -97,11 +97,10 @@ def choose_mode(
     With ``fourcc`` the mode has this pixel format.
     """
 
-    def rank(mode: VideoMode) -> tuple[float, bool, bool, float, int]:
+    def rank(mode: VideoMode) -> tuple[float, bool, float, int]:
         apart = abs(mode.width - width) + abs(mode.height - height)
         slow = 0 < mode.fps < 0.9 * fps
-        order = (UNCOMPRESSED + COMPRESSED).index(mode.fourcc)
-        return apart, slow, not slow and mode.fourcc in COMPRESSED, -mode.fps if slow else 0.0, order
+        return apart, slow, -mode.fps if slow else 0.0, (UNCOMPRESSED + COMPRESSED).index(mode.fourcc)
 
     known = [mode for mode in offered if mode.fourcc in UNCOMPRESSED + COMPRESSED]
     return min((mode for mode in known if fourcc in (None, mode.fourcc)), key=rank, default=None)

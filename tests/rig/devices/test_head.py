@@ -23,6 +23,7 @@ from rig.devices.head.protocol import (
     DEADMAN_MIN_MS,
     PROTOCOL_VERSION,
     HeadFault,
+    HeadState,
     Reset,
 )
 from rig.devices.head.samples import head_sensor
@@ -127,6 +128,19 @@ def test_only_deadmen_of_the_head_can_be_configured():
 
 
 # -- outputs -----------------------------------------------------------------------------------------------------
+
+
+@AVR_NIGHTLY
+def test_light_and_power_follow_requests(opened):
+    switch_on(opened)
+    opened.imu.set_light(0.2)
+    opened.clock.sleep(5.0)  # heartbeats are sent in the background
+    assert opened.head.light == pytest.approx(0.2, abs=0.005)
+    assert opened.head.relay_closed
+    assert opened.imu.status.state is HeadState.ACTIVE
+    opened.imu.close()
+    assert not opened.head.relay_closed
+    assert opened.head.light == 0
 
 
 # -- safety functions -----------------------------------------------------------------------------------------------

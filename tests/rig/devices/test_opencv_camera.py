@@ -177,6 +177,18 @@ def test_opening_errors_name_the_cause(tmp_path: Path) -> None:
         open_capture("/dev/null")
 
 
+def test_recording_is_played_from_its_file(world: World, tmp_path: Path) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "video.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 48))
+    for level in range(40, 240, 5):
+        writer.write(np.full((48, 64, 3), level, np.uint8))
+    writer.release()
+    settings = CameraConfig(exposure_us=None, gain=None, white_balance_k=None)
+    camera = OpenCvCamera(open_capture(tmp_path / "video.avi"), clock=world.clock, settings=settings)
+    assert (camera.time_base, camera.modes, camera.controls) == (TimeBase.RECORDED, (), ())
+    levels = [camera.capture(world.clock.now_ns(), lambda: None).image_bgr.mean() for _ in range(3)]
+    assert levels == pytest.approx([levels[0], levels[0] + 5, levels[0] + 10], abs=1)
+
+
 # -- focus and other controls --------------------------------------------------------------------------------------
 
 

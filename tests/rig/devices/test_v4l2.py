@@ -67,6 +67,10 @@ def test_uncompressed_mode_is_chosen_if_it_is_fast_enough(monkeypatch, tmp_path)
     assert choose_mode(offered, 1920, 1080, 30).fourcc == "MJPG"
     assert choose_mode(offered, 1920, 1080, 5).fourcc == "YUYV"
     assert str(choose_mode(offered, 800, 600, 30, "MJPG")) == "640x480 at 30 frames/s (MJPG)"
+    fast, slow, silent = (VideoMode(name, 640, 480, fps) for name, fps in (("MJPG", 30), ("YUYV", 26), ("YUYV", 0)))
+    assert [choose_mode([fast, slow], 640, 480, fps) for fps in (30, 28)] == [fast, slow]  # a tenth less is enough
+    assert choose_mode([fast, silent], 640, 480, 30) is silent  # its rate is not known
+    assert choose_mode([slow, VideoMode("YUYV", 640, 480, 5)], 640, 480, 30) is slow
     assert choose_mode((), 640, 480, 30) is None
     assert choose_mode([VideoMode("H264", 640, 480, 30)], 640, 480, 30) is None
 
