@@ -482,9 +482,8 @@ class OpenEnrollment:
                 f"{self.object_name!r} was deleted during its enrollment.",
                 next_step=(Do.UNDELETE(name=self.object_name), Do.CONTINUE_ENROLLMENT(name=self.object_name)),
             )
-        ended = found.statuses.get(self.id)
         is_there = found.transaction.scalar(select(Enrollment.id).where(Enrollment.id == self.id)) is not None
-        status = ended.status if ended is not None and is_there else None
+        status = found.status_of(self.id) if is_there else None
         if status != EnrollmentStatus.IN_PROGRESS:
             raise CatalogError(
                 f"The enrollment of {self.object_name!r} is {status or 'gone'}, not in progress.",

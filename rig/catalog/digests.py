@@ -20,16 +20,30 @@ from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.types import NullType
 
 from rig.catalog.columns import stored_type
-from rig.catalog.facts import Enrollment, Row, Session, View, digested, sha256_of
+from rig.catalog.facts import Enrollment, Entry, Row, Session, View, digested, sha256_of
 from rig.catalog.jobs import portions
 
 AT_ONCE: Final = 100
 """Enrollments whose rows are in memory at once."""
 
 
+def damaged_lines(transaction: Transaction, end: int, digest: str) -> Iterator[int]:
+    """Yield the numbers of lines of a log with this end that are missing or not as they were written."""
+    last, before = 0, ""
+    columns = select(Entry.id, Entry.digest, *_raw(_is_postgres(transaction), Entry)).order_by(Entry.id)
+    for number, found, *row in transaction.execute(columns.execution_options(yield_per=500)):
+        yield from range(last + 1, number)
+        if found != sha256_of((before if number == last + 1 else "", *row)):
+            yield number
+        last, before = number, found
+    yield from range(last + 1, end)
+    if (last, before) != (end, digest):
+        yield max(last, end)
+
+
 def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None]) -> Iterator[int]:
     """Yield which of these enrollments, by their ids and seals, are not as they were written."""
-    is_postgres = transaction.get_bind().dialect.name == "postgresql"
+    is_postgres = _is_postgres(transaction)
     for part in portions(sorted(seals), AT_ONCE):
         keys: dict[int, str] = dict(
             transaction.execute(select(Enrollment.id, Enrollment.key).where(Enrollment.id.in_(part))).all()
@@ -49,6 +63,10 @@ def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None
                     wrong.add(number)
         wrong |= {number for number, own in digests.items() if seals[number] not in (None, sha256_of(tuple(own)))}
         yield from sorted(wrong)
+
+
+def _is_postgres(transaction: Transaction) -> bool:
+    return transaction.get_bind().dialect.name == "postgresql"
 
 
 def _raw(is_postgres: bool, table: type[Row]) -> list[ColumnElement[Any]]:

@@ -131,21 +131,6 @@ def wrong_lines(transaction: Transaction, lines: Iterable[Entry]) -> list[Entry]
     return wrong
 
 
-def damaged_numbers(transaction: Transaction) -> Iterator[tuple[int, str | None]]:
-    """Yield the numbers of lines that are missing or not as they were written, with the names of their objects."""
-    end, digest = head(transaction)
-    for start in range(1, end + 1, 1000):
-        numbers = range(start, min(start + 1000, end + 1))
-        lines = transaction.scalars(select(Entry).where(Entry.id >= numbers[0], Entry.id <= numbers[-1])).all()
-        names = {line.id: line.object_name for line in lines}
-        wrong = {line.id for line in wrong_lines(transaction, lines)} | (set(numbers) - names.keys())
-        yield from ((number, names.get(number)) for number in sorted(wrong))
-    newest = transaction.scalar(select(Entry.digest).where(Entry.id == end)) or ""
-    beyond = transaction.scalar(select(func.max(Entry.id))) or 0
-    if newest != digest or beyond > end:
-        yield max(end, beyond), None
-
-
 def shown(entry: Entry) -> dict[str, Any]:
     """Return what readers of the log see of a line, as JSON values but for its time."""
     names = ("id", "time_utc", "user", "host", "software", "action", "object_name", "details")

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from difflib import get_close_matches
+from functools import cached_property
 from hashlib import sha256
 from typing import Any, Final, NamedTuple
 
@@ -100,15 +101,22 @@ class Used(NamedTuple):
 class State:
     """The state of a catalog as a transaction sees it.
 
-    ``objects`` are the lines of the log that give each object its present state, by its id, in the order in which the
-    objects were added. ``statuses`` are the lines that give each enrollment its present status, by its id. The lines
-    are as they are stored: a method compares those that it uses with their digests, unless it says otherwise.
+    Lines of the log are read when they are needed: with each view, a bench asks for one object and one enrollment only.
+    They are as they are stored: a method compares those that it uses with their digests, unless it says otherwise.
     """
 
     def __init__(self, transaction: Transaction, clock: Clock) -> None:
         self.transaction, self._clock = transaction, clock
-        self.objects: dict[int | None, Entry] = {line.object_id: line for line in transaction.scalars(_STATES)}
-        self.statuses: dict[int | None, Entry] = {line.enrollment_id: line for line in transaction.scalars(_STATUSES)}
+
+    @cached_property
+    def objects(self) -> dict[int | None, Entry]:
+        """The lines that give each object its present state, by its id, in the order in which they were added."""
+        return {line.object_id: line for line in self.transaction.scalars(_STATES)}
+
+    @cached_property
+    def statuses(self) -> dict[int | None, Entry]:
+        """The lines that give each enrollment its present status, by its id."""
+        return {line.enrollment_id: line for line in self.transaction.scalars(_STATUSES)}
 
     def check(self) -> None:
         """Raise `CatalogDamaged` if a line of the state is missing or not as it was written."""
@@ -156,9 +164,20 @@ class State:
 
     def by_id(self, object_id: int | None) -> Entry:
         """Return the state of an object, in use or deleted."""
-        if (found := self.objects.get(object_id)) is None:
+        if (found := self._last(Entry.deleted, Entry.object_id, object_id)) is None:
             raise damaged("the owner of an enrollment", object_id)
         return self._checked(found)
+
+    def status_of(self, enrollment_id: int) -> EnrollmentStatus | None:
+        """Return the status of an enrollment, unchecked; None if there is none."""
+        found = self._last(Entry.status, Entry.enrollment_id, enrollment_id)
+        return None if found is None else found.status
+
+    def _last(
+        self, sets: InstrumentedAttribute[Any], of: InstrumentedAttribute[Any], number: int | None
+    ) -> Entry | None:
+        wanted = select(Entry).where(of == number, sets.is_not(None)).order_by(Entry.id.desc()).limit(1)
+        return self.transaction.scalar(wanted)
 
     def _checked(self, line: Entry) -> Entry:
         check_lines(self.transaction, [line])

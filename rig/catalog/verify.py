@@ -4,6 +4,7 @@ Decision: docs/decisions/0009.
 """
 
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from sqlalchemy import func, or_, select
 
-from rig.catalog import describing, log
+from rig.catalog import describing, digests, log
 from rig.catalog.catalog import Catalog
 from rig.catalog.facts import Derived, Enrollment, Entry, View
 from rig.catalog.images import Images, path_of
@@ -124,7 +125,10 @@ def verify(catalog: Catalog, *, jobs: int | None = None) -> Generator[JobProgres
 
 
 def _lines(state: State) -> Iterator[CatalogFinding]:
-    for number, name in log.damaged_numbers(state.transaction):
+    for number in [*digests.damaged_lines(state.transaction, *log.head(state.transaction))]:
+        name = None
+        with suppress(CatalogDamaged):  # the name itself may be damaged
+            name = state.transaction.scalar(select(Entry.object_name).where(Entry.id == number))
         yield CatalogFinding(CatalogProblem.LOG_CHANGED, name, details={"entry_id": number})
     log.check_complete(state.transaction)  # its error is one more finding
 
@@ -152,11 +156,13 @@ def _images(state: State, changed: Collection[int]) -> list[_RequiredImage]:
     named = select(_IMAGE.enrollment_id, _IMAGE.view_id, _IMAGE.image, _IMAGE.image_bytes).where(
         _IMAGE.image.is_not(None), or_(_IMAGE.enrollment_id.is_(None), _IMAGE.enrollment_id.not_in(changed))
     )
-    found = []
-    for enrollment_id, *image in state.transaction.execute(named):
-        owner = state.objects.get(owners.get(enrollment_id))
-        found.append(_RequiredImage(None if owner is None else owner.object_name, *image))
-    return found
+    names: dict[int | None, str | None] = {}
+    with suppress(CatalogDamaged):  # if a line of the log cannot be read, no image has the name of its object
+        names = {number: line.object_name for number, line in state.objects.items()}
+    return [
+        _RequiredImage(names.get(owners.get(enrollment_id)), *image)
+        for enrollment_id, *image in state.transaction.execute(named)
+    ]
 
 
 def _check_images(store: Images, portion: Sequence[_RequiredImage]) -> list[CatalogFinding]:

@@ -16,6 +16,7 @@ from tests.rig.catalog.catalog_samples import (
     finished,
     image,
     plan,
+    record,
     sql,
 )
 
@@ -75,9 +76,10 @@ class TestVerify:
             assert found in concerned(finished(verify(reader, jobs=1)))
 
     @pytest.mark.sqlite
-    def test_images_are_checked_although_lines_of_the_log_are_damaged(self, catalog: Catalog) -> None:
+    @pytest.mark.parametrize("column", ["user", "time_utc"])  # a line with another time cannot be read
+    def test_images_are_checked_although_lines_of_the_log_are_damaged(self, catalog: Catalog, column: str) -> None:
         lost = self.images(catalog, "tin")[1]
-        sql(catalog, "UPDATE log SET user = 'x' WHERE id = 2", "DELETE FROM log WHERE id = 3")
+        sql(catalog, f"UPDATE log SET {column} = 'x' WHERE id = 2", "DELETE FROM log WHERE id = 3")
         lost.unlink()
         found = concerned(finished(verify(catalog, jobs=1)))
         assert {
@@ -85,6 +87,13 @@ class TestVerify:
             (CatalogProblem.LOG_CHANGED, None),
             (CatalogProblem.MISSING_IMAGE, None),
         } <= set(found)
+
+    @pytest.mark.sqlite
+    def test_view_is_stored_although_a_line_of_another_object_cannot_be_read(self, catalog: Catalog) -> None:
+        enrollment = catalog.begin("jar", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
+        sql(catalog, "UPDATE log SET time_utc = 'x' WHERE id = 2")
+        enrollment.add(record(0), image(0))  # it reads its own lines only: with many objects, all lines take too long
+        assert enrollment.missing() == (1,)
 
     @pytest.mark.sqlite
     def test_removed_and_added_enrollments_are_found(self, catalog: Catalog) -> None:
