@@ -101,7 +101,7 @@ def _rows(text: str) -> Iterator[tuple[int, Mapping[str | None, Any]]]:
             next_step="Correct it.",
         )
     for row in reader:
-        if any(row.values()):
+        if any("".join(cell or "").strip() for cell in row.values()):
             yield reader.line_num, row
 
 

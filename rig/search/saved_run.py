@@ -240,6 +240,9 @@ def load_run(folder: Path) -> SavedRun:
         lines = [_object(line) for line in _lines(content)[: -1 if is_cut else None]]
         has_failed = bool(lines) and "event" not in lines[-1]
         failed = _PROBLEM.validate_python(lines.pop()) if has_failed else None
+    except ValidationError as error:
+        where = "run.json" if error.title == About.__name__ else "the error at the end of events.jsonl"
+        raise _damaged(folder, f"{where}: {_reason(error)}") from error
     except CatalogError as error:
         raise _damaged(folder, f"{error.what.rstrip('.')}: {error.evidence['reason']}") from error
     except _DAMAGE as error:

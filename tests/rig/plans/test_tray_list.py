@@ -33,7 +33,7 @@ def mistakes(tmp_path, text):
 
 def test_lists_of_spreadsheets_are_read(tmp_path):
     expected = (TrayItem(2, "mug", "kitchen", "white, chipped"), TrayItem(4, "lamp", "", "", 12))
-    comma = 'name,label,note,views\nmug,kitchen,"white, chipped",\n\nlamp,,,12\n'
+    comma = 'name,label,note,views\nmug,kitchen,"white, chipped",\n ,,,,,\nlamp,,,12\n'
     assert read_tray(written(tmp_path, comma)) == expected
     semicolon = '\ufeffName;Label;Note;Views\r\nmug;kitchen;"white, chipped";\r\n\r\nlamp;;;12\r\n'
     assert read_tray(written(tmp_path, semicolon)) == expected

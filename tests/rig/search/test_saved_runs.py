@@ -117,10 +117,11 @@ def test_interrupted_run_is_read_to_its_last_event(saved, tmp_path):
     [
         ("run.json", b"{", "cannot be read"),
         ("run.json", b"[]", "cannot be read"),
-        ("run.json", b'{"format": "other"}', "cannot be read"),
+        ("run.json", b'{"format": "other"}', "run.json: format: "),
         ("run.json", b'{"format": "hbr-rig run", "version": 99}', "version 99"),
         ("model.jsonl", b'{"object": "a", "azimuth_deg": [0], "descriptors": ["00"]}\n', "cannot be read"),
         ("events.jsonl", b"\xff\xfe\n", "cannot be read"),
+        ("events.jsonl", b'{"code": 1}\n', "the error at the end of events.jsonl: title: "),
         ("events.jsonl", b'{"event": "exploded"}\n', "cannot be read"),
         ("events.jsonl", b'{"event": "started", "plan": 3, "name": null, "views": 4, "conditions": {}}\n', "cannot"),
         ("frames/001.png", b"no picture", "cannot be read"),
@@ -132,7 +133,7 @@ def test_damaged_run_is_rejected(saved, tmp_path, name, content, words):
     (folder / name).write_bytes(content)
     with pytest.raises(UsageError) as caught:
         check(load_run(folder))
-    assert words in str(caught.value)
+    assert words in f"{caught.value} {caught.value.evidence}"
     assert caught.value.next_step
 
 
