@@ -125,8 +125,11 @@ class _Table(Mapping[str, Any]):
 def _sentence(name: str) -> str:
     """Return the first sentence about a command: of its function, or of the module of a group. Nothing is imported."""
     point = _places()[name]
-    spec = find_spec(point.module)
-    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else "")
+    try:
+        spec = find_spec(point.module)
+        tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else "")
+    except Exception as broken:  # the help of the other commands does not need this plug-in
+        return neutral(f"Cannot be loaded: {broken}.")
     functions = [one for one in tree.body if isinstance(one, ast.FunctionDef) and one.name == point.attr]
     text = ast.get_docstring(functions[0] if functions else tree)
     return neutral(re.split(r"\.\s", text or "")[0].removesuffix(".")) + "."

@@ -125,7 +125,8 @@ def test_unexpected_errors_and_broken_plug_ins_are_neutral(tmp_path):
     about = tmp_path / "plugin-1.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1\n")
-    (about / "entry_points.txt").write_text("[rig.commands]\nbroken = broken_plugin:go\nraising = raising_plugin:go\n")
+    commands = "broken = broken_plugin:go\nraising = raising_plugin:go\nremoved = removed.plugin:go\n"
+    (about / "entry_points.txt").write_text(f"[rig.commands]\n{commands}")
     (tmp_path / "broken_plugin.py").write_text("raise RuntimeError('\\x1b[2Jbroken')")
     (tmp_path / "raising_plugin.py").write_text(
         "from rig.cli.ui.command import command\nfrom rig.cli.ui.settings import Settings\n\n\n"
@@ -137,6 +138,8 @@ def test_unexpected_errors_and_broken_plug_ins_are_neutral(tmp_path):
     assert is_safe(done.stdout + done.stderr)
     assert "The plug-in broken_plugin:go cannot be loaded" in done.stderr
     assert "\\u001b[2Jbroken" in done.stderr
+    done = subprocess.run([*RIG, "--help"], env=environment, capture_output=True, text=True, check=True)
+    assert re.search(r"^  removed +Cannot be loaded: No module named 'removed'\.$", done.stdout, re.MULTILINE)
     done = subprocess.run([*RIG, "raising"], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert is_safe(done.stdout + done.stderr)
