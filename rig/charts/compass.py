@@ -49,6 +49,7 @@ def dial() -> str:
         *_rim(every=90),
         svg.element("circle", id="budget", class_="ring", **ring),
         svg.element("circle", id="used", class_="ring", pathLength=1.0, **ring),
+        svg.element("line", id="gyro", y2=CENTRE[1] - 100, **needle),
         svg.element("line", id="needle", y2=CENTRE[1] - 148, **needle),
     ]
     return svg.drawing(SIZE, SIZE, "angle of the table, seen from above", parts)

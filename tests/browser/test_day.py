@@ -65,6 +65,9 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     page.goto(f"{server.url}identify")
     page.fill("#sample", "S-1")
     page.click("#go")
+    page.wait_for_selector("#answer.found:has-text('mug-star')")
+    box = [float(page.get_attribute("#marks rect", key)) for key in ("width", "height")]
+    assert 100 < box[0] < box[1] < 300  # of a mug
     for _ in range(2):
         page.wait_for_selector("#answer.found:has-text('mug-star')")
         page.locator("#enrolled img").evaluate("(image) => image.decode()")
@@ -121,6 +124,7 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     page.wait_for_selector("#dial-text:has-text('89.')")  # friction holds the table half a degree short
     rotated = page.get_attribute("#needle", "transform")
     assert rotated.startswith("rotate(-89")  # counter-clockwise from the top, as the table rotates seen from above
+    assert page.get_attribute("#gyro", "transform").startswith("rotate(-89")
     page.click("#jog button:has-text('−5')")
     page.wait_for_selector("#dial-text:has-text('84.')")
     page.click("#doctor")

@@ -3,6 +3,7 @@ import "./pictures.js";
 import "./shelf.js";
 
 const STATES = ["disconnected", "connected", "unreferenced", "ready", "moving", "stopped", "fault"];
+let gyro = null; // the angle of the table by the gyro, after the last move
 let tableDeg = null;
 
 // -- the dial ----------------------------------------------------------------------------------------------------------------
@@ -13,8 +14,10 @@ function dial(status) {
   const [low, high] = status.limits_deg || [-360, 360];
   const known = angle !== null && angle !== undefined;
   tableDeg = known ? angle : null;
-  $("needle").toggleAttribute("hidden", !known);
-  if (known) $("needle").setAttribute("transform", `rotate(${-angle} 200 200)`);
+  for (const [id, degrees] of [["needle", angle], ["gyro", gyro]]) {
+    $(id).toggleAttribute("hidden", !known || degrees === null);
+    $(id).setAttribute("transform", `rotate(${-degrees} 200 200)`);
+  }
   const used = known ? Math.min(Math.abs(angle) / Math.max(Math.abs(angle < 0 ? low : high), 1), 1) : 0;
   $("used").setAttribute("stroke-dasharray", `${used} 1`);
   $("used").setAttribute("transform", `translate(200 200) rotate(-90) scale(1 ${angle < 0 ? 1 : -1}) translate(-200 -200)`);
@@ -71,6 +74,7 @@ on("status", (status) => {
   if (status.limits_deg) dial(status);
   $("states").replaceChildren(...STATES.map((state) => h("li", { class: state === status.state ? `current ${state}` : "", "aria-current": state === status.state }, state)));
   const values = [["Cable", status.limits_deg ? `from ${number(status.limits_deg[0])}° to ${number(status.limits_deg[1])}°` : "–"]];
+  if (gyro !== null) values.push(["By the gyro", `${number(gyro, 2)}°`]);
   if (status.servo) values.push(["Servo", `${status.servo.model.replaceAll("_", "-").toUpperCase()}, ${number(status.servo.temperature_c)} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${number(status.servo.load_percent, 0)} %`]);
   if (status.camera) values.push(["Camera", `${status.camera.name}, ${status.camera.width} × ${status.camera.height}`]);
   for (const finding of status.findings || []) values.push(["Note", finding]);
@@ -78,6 +82,10 @@ on("status", (status) => {
   $("set-angle").hidden = !status.doubt;
   $("doubt").textContent = status.doubt ? `The table's angle is in doubt: ${status.doubt}.` : "";
   showLocks(status.locks || {});
+});
+
+on("plan", (event) => {
+  if (event.event === "moved") gyro = event.rotation_imu_deg === null ? null : event.encoder_deg - event.rotation_encoder_deg + event.rotation_imu_deg;
 });
 
 // -- jobs, the check of the bench ------------------------------------------------------------------------------------------

@@ -31,12 +31,16 @@ class RigLive extends HTMLElement {
 
   connectedCallback() {
     this.image = h("img", { id: "live-image", class: "whole", alt: "Live image of the table" });
-    this.marks = h("svg", { id: "marks", "aria-hidden": "true" }); // of the page, in pixels of the image
+    this.marks = h("svg", { id: "marks", "aria-hidden": "true" }); // in pixels of the image
     this.age = h("p", { id: "live-age", role: "status", hidden: true });
     this.frame = h("div", { class: "picture", id: "live" }, this.image, this.marks, this.age);
     this.append(this.frame);
     this.image.addEventListener("load", () => this.fit());
     on("status", (status) => { if (status.open) { this.region = status.region; this.fit(); } });
+    on("plan", ({ event, segmentation }) => {
+      if (["started", "moved", "waiting"].includes(event)) this.marks.replaceChildren();
+      if (segmentation?.box_px) this.showBox(segmentation.box_px);
+    });
     this.fetchAll();
     setInterval(() => this.mark(), 500);
   }
@@ -52,6 +56,12 @@ class RigLive extends HTMLElement {
     [style.left, style.top] = [`${(-100 * x) / w}%`, `${(-100 * y) / tall}%`];
     style.maxWidth = "none";
     this.marks.setAttribute("viewBox", `${x} ${y} ${w} ${tall}`);
+  }
+
+  /** Show where the program found the object, by its box in the region. */
+  showBox([x, y, width, height]) {
+    const [left, top] = this.region || [0, 0];
+    this.marks.replaceChildren(h("rect", { x: left + x, y: top + y, width, height, fill: "none", stroke: "#ffd34d", "stroke-width": 2, "vector-effect": "non-scaling-stroke" }));
   }
 
   async fetchOne() {
