@@ -168,14 +168,14 @@ def stated(key: Key, value: Any) -> str:
 def _edited(text: str, key: Key, value: Any) -> str:
     """Return the document with the line of a key replaced or inserted; the caller checks that it is right."""
     # Where the table of the key begins; a new one goes to the end of the file.
-    lines = StringIO(text, newline="").readlines()
+    lines, newline = StringIO(text, newline="").readlines(), "\r\n" if "\r\n" in text else "\n"
     new = f"{_written(key[-1:])} = {stated(key, value)}"
     headers = [at for at, line in enumerate(lines) if _HEADER.fullmatch(line.rstrip())]
     begin = next((at + 1 for at in headers if _table(lines[at]) == key[:-1]), 0 if len(key) == 1 else None)
     if begin is None:
         before = "".join(lines)
-        gap = "\n" * (bool(before) + (bool(before) and not before.endswith("\n")))
-        return f"{before}{gap}[{_written(key[:-1])}]\n{new}\n"
+        gap = newline * (bool(before) + (bool(before) and not before.endswith("\n")))
+        return f"{before}{gap}[{_written(key[:-1])}]{newline}{new}{newline}"
     end = next((at for at in headers if at >= begin), len(lines))
     # Replace the value, and keep its comment.
     for at in range(begin, end):
@@ -188,8 +188,8 @@ def _edited(text: str, key: Key, value: Any) -> str:
     last = [at + 1 for at in range(begin, end) if lines[at].strip() and not lines[at].lstrip().startswith("#")]
     place = next((at + 1 for at in range(begin, end) if default.match(lines[at])), max(last, default=begin))
     if place and not lines[place - 1].endswith("\n"):
-        lines[place - 1] += "\n"
-    return "".join([*lines[:place], f"{new}\n", *lines[place:]])
+        lines[place - 1] += newline
+    return "".join([*lines[:place], new, newline, *lines[place:]])
 
 
 def _table(line: str) -> Key:

@@ -143,6 +143,8 @@ def _mistake(known: Mapping[Key, KeyInfo], values: Mapping[str, Any], key: Key, 
     for part in key:
         found = found[part] if isinstance(found, Mapping) and part in found else error["input"]
     shown = "" if isinstance(found, Mapping | BaseModel) else f" (found {found!r})"
+    if error["type"] == "model_type":
+        return f"must be a section with keys{shown}"
     if error["type"] == "value_error" or key not in known:
         return str(error.get("ctx", {}).get("error", error["msg"])) + shown
     return f"must be {known[key].values}{shown}"

@@ -65,7 +65,7 @@ def test_first_top_level_key_is_inserted_before_the_first_table():
 
 
 def test_windows_line_ends_stay_and_empty_file_gets_a_table():
-    assert with_values("a = 1\r\n", {("servo", "id"): 2}) == "a = 1\r\n\n[servo]\nid = 2\n"
+    assert with_values("a = 1\r\n", {("servo", "id"): 2}) == "a = 1\r\n\r\n[servo]\r\nid = 2\r\n"
     assert with_values("", {("servo", "id"): 2}) == "[servo]\nid = 2\n"
 
 

@@ -160,7 +160,7 @@ def test_set_changes_one_line_or_nothing(rig, tmp_path):
     assert "rig.toml is unchanged: it would have mistakes." in rejected.stderr
     assert "    servo.id: must be a whole number from 0 to 252 (found 900)" in rejected.stderr
     assert rig("config", "set", "servo.prot", "x").exit_code == 3
-    assert rig("config", "set", "servo", "x").exit_code == 3
+    assert "servo: must be a section with keys (found 'x')" in rig("config", "set", "servo", "x").stderr
     fault = rig("config", "set", "bench.sim.faults", '["jam@never"]')
     assert fault.exit_code == 3
     assert "bench.sim.faults: Cannot read the fault 'jam@never'." in fault.stderr
