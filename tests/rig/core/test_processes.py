@@ -7,13 +7,18 @@ import pytest
 from rig.core.errors import RigError
 from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
-from tests.rig.core.work import square
+from tests.rig.core.work import blocks_interrupts, square
 
 
 def test_killed_process_raises_an_error_with_a_next_step() -> None:
     with pytest.raises(RigError, match="ended before it was done") as lost:
         list(map_in_processes(square, range(6), 2))
     assert Do.RUN_AGAIN(jobs=1) in lost.value.steps
+
+
+def test_interrupt_of_a_terminal_reaches_this_process_alone() -> None:
+    assert sorted(map_in_processes(blocks_interrupts, [1, 2], 2)) == [(1, True), (2, True)]
+    assert not blocks_interrupts(1)
 
 
 def test_one_job_runs_in_this_process() -> None:

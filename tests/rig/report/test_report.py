@@ -1,6 +1,7 @@
 """The report is one self-contained file, shows the content of the records, and escapes all names."""
 
 import re
+import time
 from base64 import b64decode
 from datetime import datetime, timedelta, timezone
 from html.parser import HTMLParser
@@ -87,8 +88,13 @@ def demo(title: str = "Demo", names: tuple[str, ...] = NAMES) -> str:
     return render_report(title, "Two objects.", enrollments, identifications, meta=META)
 
 
-def test_page_shows_the_content_of_the_records() -> None:
-    page = Page(demo())
+def test_page_shows_the_content_of_the_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+        time.tzset()
+        html = demo()
+    time.tzset()
+    page = Page(html)
     results = page.tables[0]
     assert results[0] == [
         "#", "on the table", "found as", "correct?", "views", "rotation", "pose error", "score", "margin"
@@ -99,7 +105,8 @@ def test_page_shows_the_content_of_the_records() -> None:
         ["3", "globe (never enrolled)", "unknown", "✓ correct", "2", "90°", "–", "0.910", "+0.100"],
         ["4", "mug-white", "mug-white", "✓ correct", "2", "90°", "–", "0.910", "+0.100"],
     ]
-    assert page.text.startswith("Demo Demo 2026-01-02")
+    assert set(results[0]) <= set(re.findall(r'<abbr title="[^"]+">([^<]+)</abbr>', html))
+    assert page.text.startswith("Demo Demo 2026-01-02 04:04 CET Two objects.")
     # on a phone, which shows no heads, each cell has its own label
     labels = {attributes["data-label"] for attributes in page.all("td") if "data-label" in attributes}
     assert labels >= {"found as", "views", "rotation", "pose error", "score", "margin"}

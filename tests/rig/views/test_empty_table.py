@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -166,6 +167,10 @@ def test_age_and_settings_are_problems_and_another_size_is_not_usable(simulated:
     status = empty_table_status(s.bench)
     assert status.table is not None
     assert status.problems[0] == TableProblem(TableProblemCode.OLD, {"hours": 13.0})
+    camera = s.bench.camera.identity
+    for device, expected in ((camera.device, TableProblemCode.OLD), ("another", TableProblemCode.OTHER_CAMERA)):
+        s.bench.camera.identity = replace(camera, name="/dev/video7", device=device)  # another name of a camera
+        assert empty_table_status(s.bench).problems[0].code is expected
     other = simulated("camera.width=640", "camera.height=480", "view.roi=[80, 0, 480, 480]")
     other.bench.state = s.bench.state
     status = empty_table_status(other.bench)
