@@ -74,7 +74,8 @@ class SimOptions(Section):
             NoiseModel(**values)
         except ValidationError as error:
             mistake = error.errors()[0]
-            raise ValueError(": ".join([*map(str, mistake["loc"][:1]), mistake["msg"]])) from None
+            name = "".join(f"{part}: " for part in mistake["loc"][:1])
+            raise ValueError(name + mistake["msg"].removeprefix("Value error, ")) from None
         return values
 
 

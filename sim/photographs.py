@@ -25,6 +25,7 @@ from sim.world import SimObject, World
 
 NAME = "photographs"
 _SECTION = f"bench.{NAME}"
+_SIDE_PX = (80, 8000)  # of `rig.config.schema.CameraConfig`
 _VIEWS = (4, 720)  # of `rig.config.schema.EnrollConfig`
 _SHOWN = 3
 _KEPT = 16  # decoded photographs: a move goes from one to the next, and large ones take 30 MB each
@@ -173,6 +174,12 @@ class PhotographedObjects:
         """
         values = config.model_dump(exclude_unset=True)
         width, height = self.size
+        if not _SIDE_PX[0] <= min(self.size) <= max(self.size) <= _SIDE_PX[1]:
+            raise ConfigError(
+                f"{self.first} has {width} x {height} pixels; a camera has from {_SIDE_PX[0]} to {_SIDE_PX[1]} along "
+                "each side.",
+                next_step="Scale the photographs.",
+            )
         values["camera"] = values.get("camera", {}) | {"width": width, "height": height}
         values["view"] = {"roi": self.region} | values.get("view", {})
         most = max(len(one.files) for one in self.enrolled.values())

@@ -171,7 +171,7 @@ def _wrong_model(devices: SimDevices, _rng: Rng) -> End:
     volts=Parameter(4.0, "supply voltage, V", 0, 30),
 )
 def _brownout(devices: SimDevices, _rng: Rng, volts: float) -> End:
-    servo, volts = devices.servo, volts
+    servo = devices.servo
     if volts < LOWEST_SUPPLY_V:
         servo.power_off()
     servo.set_voltage(volts)

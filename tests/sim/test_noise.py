@@ -38,6 +38,7 @@ def test_model_without_noise_has_no_noise() -> None:
     [
         ("servo.baud=12345", "57600"),
         ("bench.sim.noise.structure_damping=1.5", "structure_damping: Input should be less than 1"),
+        ("bench.sim.noise.motion_px=0.5", "noise: motion_px: give a length of at least 1"),
     ],
 )
 def test_invalid_simulated_bench_is_a_configuration_error(setting: str, words: str) -> None:

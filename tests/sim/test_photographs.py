@@ -198,7 +198,7 @@ def damaged(folder: Path) -> None:
         (Path.mkdir, "No photograph in photographs", "bench.photographs.pattern"),
         (lambda folder: save(folder, step_deg=360), "obj1 has 1 photograph to enroll it with", "Add photographs"),
         (replaced(np.zeros((90, SIZE, 3), np.uint8)), "obj1__90.png has 100 x 90 pixels", "one size"),
-        (small, "60 x 60 pixels", "Fix the listed keys"),
+        (small, "60 x 60 pixels", "Scale the photographs"),
         (damaged, "obj1__90.png cannot be used: truncated", "Replace or remove"),
     ],
 )
