@@ -35,8 +35,10 @@ def test_simulated_sensor_lies_within_the_stated_uncertainty(simulated, sensors)
     z = []
     for seed in range(sensors):
         s = simulated(seed=seed)
+        servo, imu = s.bench.servo, s.bench.imu
         *_, result = ImuMounting().live(s.bench)
         assert result.passed, result.rejections
+        assert (s.bench.servo, s.bench.imu) == (servo, imu), "a recorder is left on the bench"
         part = s.operator.devices.imu.inertial
         z += in_sigmas(result, **{f"accel_zero_{name}": part.accel_bias_g[i] for i, name in enumerate("xyz")})
         z += in_sigmas(result, **{f"tilt_{name}": degrees(part.up[i]) for i, name in enumerate("xy")})

@@ -51,7 +51,14 @@ def test_short_cable_is_rejected_before_moving(simulated, procedure, settings):
 
 
 @pytest.mark.parametrize(
-    "words", [("servo", "--revolutions", "0"), ("servo", "--reversals", "2"), ("imu", "--repeats", "3")]
+    "words",
+    [
+        ("servo", "--revolutions", "0"),
+        ("servo", "--reversals", "2"),
+        ("imu", "--revolutions", "3"),
+        ("imu", "--repeats", "3"),
+        ("shaper", "--stops", "3"),
+    ],
 )
 def test_too_few_moves_are_a_usage_error(rig, words):
     assert rig("calibrate", *words).exit_code == 2

@@ -14,7 +14,7 @@ from sim.noise import NoiseModel
 from tests.calibration.drawn import codes, in_sigmas
 from tests.rig.bench_parts import LAG_S, at_rest, motion_bench
 
-OTHERS = [(hz, damping, 3) for hz in FREQUENCIES_HZ for damping in DAMPINGS][1:]
+OTHERS = [(hz, damping, 3) for hz in FREQUENCIES_HZ for damping in DAMPINGS]
 TABLES = [(6.0, 0.02, 5), *(pytest.param(*table, marks=pytest.mark.nightly) for table in [(6.0, 0.02, 6), *OTHERS])]
 """Frequency and damping of the simulated platter, and the seed of its friction.
 

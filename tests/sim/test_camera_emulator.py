@@ -72,6 +72,16 @@ def test_exposure_and_light_act_linearly(factor: float) -> None:
     assert frame(camera(world)).mean(axis=(0, 1)) == pytest.approx([80 * factor, 80, 80], abs=0.5)
 
 
+def test_vignetting_darkens_the_corners_and_flicker_whole_frames_by_their_share() -> None:
+    world = World(noise=QUIET.with_values(vignetting=0.3, light_flicker=0.02))
+    world.put(grey(200))
+    capture = camera(world)
+    frames = np.array([frame(capture)[::479, ::71] for _ in range(30)])  # the first and the last row
+    levels = frames.mean(axis=(1, 2, 3))
+    assert frames[:, :, [0, -1]].mean() == pytest.approx(0.7 * 200, abs=1)
+    assert levels.std() / levels.mean() == pytest.approx(0.02, rel=0.35)
+
+
 # -- noise ------------------------------------------------------------------------------------------------------------
 
 

@@ -56,6 +56,15 @@ def test_stamps_rise_and_no_frame_comes_before_it_is_exposed(waits_ns: list[int]
         last = stamp_ns(capture)
 
 
+def test_lost_frames_do_not_arrive() -> None:
+    capture = camera(World(noise=QUIET.with_values(lost_frames=0.5)))
+    stamps_ns = []
+    for _ in range(40):
+        assert capture.grab()
+        stamps_ns.append(stamp_ns(capture))
+    assert 1.5 < (stamps_ns[-1] - stamps_ns[0]) * FPS * 1e-9 / 39 < 2.6  # frames from one that arrives to the next
+
+
 def test_old_frame_shows_the_world_at_its_exposure() -> None:
     world = World(noise=QUIET)
     world.put(grey(50))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
 from sim.i2c import SimI2cBus
+from sim.imu.inertial import InertialModel
 from sim.imu.mpu6050 import BANDWIDTH_HZ, SimMpu6050
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
@@ -175,6 +176,22 @@ def test_noise_has_the_density_and_the_bandwidth_of_the_filter(dlpf: int) -> Non
     assert rate.std() == pytest.approx(expected, rel=0.1)
     second = rate[: len(rate) // 500 * 500].reshape(-1, 500, 3).sum(axis=1) / 1000  # half-second integrals
     assert second.std() == pytest.approx(density / np.sqrt(2) * np.sqrt(0.5), rel=0.35)
+
+
+def test_parts_differ_and_their_bias_walks_as_the_noise_model_says() -> None:
+    noise = NoiseModel(gyro_noise_dps_rthz=0.0, gyro_bias_walk_dps_rts=0.5)
+    parts = [InertialModel(World(noise=noise, seed=seed), "imu") for seed in range(300)]
+    begun_dps = np.array([part.gyro_bias_dps for part in parts])
+    assert np.std(begun_dps) == pytest.approx(noise.gyro_bias_dps, rel=0.1)
+    assert np.std([part.gyro_gain - 1 for part in parts]) == pytest.approx(noise.gyro_scale_error, rel=0.1)
+    assert np.std([part.accel_bias_g for part in parts]) == pytest.approx(noise.accel_bias_g, rel=0.1)
+    ups = np.array([part.up for part in parts])
+    assert np.linalg.norm(ups, axis=1) == pytest.approx(1)
+    assert np.std(np.degrees(np.arcsin(ups[:, :2]))) == pytest.approx(noise.imu_tilt_deg, rel=0.1)
+    for part in parts:
+        part.sample(np.arange(1, 41) * 100_000_000, 10.0, 4.9)  # 4 s
+    walked_dps = np.array([part.gyro_bias_dps for part in parts]) - begun_dps
+    assert np.std(walked_dps) == pytest.approx(noise.gyro_bias_walk_dps_rts * 2, rel=0.1)
 
 
 @given(views_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))

@@ -18,7 +18,7 @@ from rig.cli.main import app
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from sim.objects.projection import Image
-from sim.photographs import PhotographsOnTable
+from sim.photographs import PhotographedObjects, PhotographOptions, PhotographsOnTable
 
 SIZE = 100
 GROUND = (120, 70, 30)
@@ -91,6 +91,13 @@ def test_enrollment_takes_each_photograph_with_its_own_angle(rig: Rig) -> None:
         assert image.shape == (SIZE, SIZE, 3)
         assert apart(azimuth_deg, nearest_angle("obj1", image, 45)) < 1
         np.testing.assert_allclose(image, drawn("obj1", round(azimuth_deg / 45) * 45 % 360), atol=1)
+
+
+def test_table_angles_in_the_names_run_the_other_way(tmp_path: Path) -> None:
+    source = save(tmp_path, "obj1", step_deg=90)
+    found = PhotographedObjects.read(PhotographOptions(source=source, table_angles=True)).enrolled["obj1"]
+    shown = dict(zip(found.azimuth_deg.tolist(), (path.stem for path in found.files), strict=True))
+    assert shown == {0.0: "obj1__0", 90.0: "obj1__270", 180.0: "obj1__180", 270.0: "obj1__90"}
 
 
 def test_table_of_a_file_gives_objects_angles_and_the_region(rig: Rig) -> None:

@@ -225,6 +225,10 @@ def test_servo_without_power_is_silent_and_has_no_torque(line: Line) -> None:
     line.sleep(BOOT_S)
     assert line.read("Torque Enable") == 0
     assert line.read("Present Position") == round((stopped + 30) / DEG_PER_COUNT + 2048) % 4096
+    line.servos[1].power_cycle()
+    line.servos[1].power_off()  # while it boots
+    line.sleep(BOOT_S)
+    assert not line.servos[1].powered
 
 
 @pytest.mark.parametrize(
