@@ -7,6 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.cli.main import app
+from rig.core.json_form import plain
+from sim.change import Change
 from sim.faults import Fault, fault_kinds
 from tests import small
 
@@ -83,6 +85,15 @@ def test_changed_bench_is_searched_with_the_faults_of_command_line_and_configura
     for name in ("crc_flip", "camera.slow", "i2c_nack"):
         assert f"fault begins: {name}" in done.stderr
         assert f"fault ends: {name}" in done.stderr
+
+
+@pytest.mark.nightly
+def test_json_names_the_change_of_the_bench_which_changes_every_score(runs, tmp_path):
+    done = rig("demo", *SMALL, "--seed", "5", "--change", "hard", "--json", "--out", str(tmp_path))
+    unchanged, changed = json.loads(runs[1][0]), json.loads(done.stdout)
+    assert (unchanged["change"], changed["change"]) == (None, plain(Change.named(["hard"])))
+    before, after = ([trial["score"] for trial in result["trials"]] for result in (unchanged, changed))
+    assert all(score != other for score, other in zip(before, after, strict=True))
 
 
 def test_fault_ends_the_demo_with_its_exit_code_and_next_step(tmp_path):
