@@ -43,7 +43,7 @@ class Face:
 
 
 def face(corners: ArrayLike, paint: Paint | Colour) -> Face:
-    """Return a parallelogram from its upper left, lower left, lower right and upper right corner, or a triangle."""
+    """Return a face by its corners: of a printed one the upper left, lower left, lower right and upper right corner."""
     c = np.array(corners, dtype=np.float64)
     return Face(c, paint, c[[0, -1, 1]])
 

@@ -6,6 +6,8 @@ import pytest
 from sim.camera import SimCapture
 from sim.objects.projection import TO_LIGHT
 from sim.objects.shelf import shelf
+from sim.objects.solid import empty_platter
+from sim.room import room
 from sim.world import World
 from tests.sim.drawn_camera import QUIET, camera, frame
 
@@ -25,6 +27,12 @@ def test_most_of_the_background_changes_over_90_degrees_only_for_an_orbiting_cam
     assert changed_share(orbits=True) > 0.5
     assert changed_share(orbits=False) == 0.0
     assert changed_share(orbits=False, object_name="mug-star") < 0.1
+
+
+def test_platter_under_the_object_stands() -> None:
+    empty = empty_platter()
+    on_platter = (empty != empty[0, 0]).any(axis=2)
+    np.testing.assert_array_equal(room(0, 77.0)[on_platter], empty[on_platter])
 
 
 LAMP_DEG = float(np.degrees(np.arctan2(TO_LIGHT[1], TO_LIGHT[0]))) + 90  # azimuth of a camera below the lamp
