@@ -91,14 +91,12 @@ def _places() -> dict[str, EntryPoint]:
 
 @cache
 def _built(name: str) -> Any:
-    """Import a command, and return it with its options as a command of Typer; None if it cannot be loaded."""
+    """Import a command, and return it with its options as a command of Typer."""
     point = _places()[name]
     try:
         found = point.load()
     except Exception as broken:  # the other commands work without this plug-in
-        notice = f"The plug-in {point.value} cannot be loaded, so there is no command {name}: {broken}"
-        print(neutral(notice), file=sys.stderr)
-        return None
+        raise _TYPER_USAGE_ERROR(f"The plug-in {point.value} cannot be loaded: {broken}") from broken
     frame = typer.Typer(rich_markup_mode=None)
     if isinstance(found, typer.Typer):
         frame.add_typer(found, name=name, cls=_Subcommands)
@@ -117,9 +115,9 @@ class _Table(Mapping[str, Any]):
         return len(_places())
 
     def __getitem__(self, name: str) -> Any:
-        if name not in _places() or (found := _built(name)) is None:
+        if name not in _places():
             raise KeyError(name)
-        return found
+        return _built(name)
 
 
 def _sentence(name: str) -> str:
@@ -150,6 +148,7 @@ class _Commands(TyperGroup):
         return context
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        self.commands.get(args[0])  # Typer would add to the error of a damaged plug-in what else may be meant
         found = super().resolve_command(ctx, args)
         handle_signals()  # until here only modules were imported, and Ctrl+C ended the program at once
         return found
