@@ -1,12 +1,14 @@
 """The hub sends every message once and in order to listeners that keep up, and says when messages are lost."""
 
 import asyncio
+from http.client import HTTPConnection
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.web.hub import Hub
 from tests.fuzzing import examples
+from tests.rig.web.conftest import over_http
 
 
 @examples(20)
@@ -56,6 +58,17 @@ def test_stream_resumes_after_the_last_event_id_and_says_hello_first():
     got = asyncio.run(listen())
     assert got[0] == 'id: e-2\nevent: hello\ndata: {"lost": false}\n\n'
     assert [one.splitlines()[0] for one in got[1:]] == ["id: e-3", "id: e-4", "id: e-5", "id: e-6"]
+
+
+def test_listener_whose_connection_was_lost_names_its_last_event(serve):
+    served = serve()
+    last = served.server.hub.of_job("")[1]
+    served.run(kind="home")
+    with over_http(served) as place:
+        connection = HTTPConnection(place, timeout=10)
+        connection.request("GET", "/api/v1/events", headers={"Last-Event-ID": last})
+        assert connection.getresponse().readline() == f"id: {last}\n".encode()
+        connection.close()
 
 
 def test_message_stays_in_its_line():
