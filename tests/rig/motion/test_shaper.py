@@ -15,7 +15,8 @@ from sim.noise import NoiseModel
 from tests.fuzzing import examples
 from tests.rig.bench_parts import at_rest, motion_bench
 
-USUAL, UNITS = MotionProfile(89.3, 236.0), MotionProfile(1.374, 21.4577)
+UNITS = MotionProfile(1.374, 21.4577)
+USUAL = MotionProfile(65 * UNITS.velocity_dps, 11 * UNITS.acceleration_dps2)  # a servo has whole multiples only
 
 
 def paths(plan: ShapedMove, distance_deg: float) -> list[PiecewiseMotion]:
