@@ -404,7 +404,7 @@ class EnrollConfig(Section):
 class IdentifyConfig(Section):
     """How an object is identified."""
 
-    strategy: str | None = Field(
+    strategy: Literal["dense", "arc", "ahbr", "hbr", "sweep", "random", "hmm"] | None = Field(
         None,
         description="strategy that chooses the next view; none: dense; ahbr is the paper's, hmm its successor",
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 import hbr
 from hbr import StopReason
@@ -16,7 +17,7 @@ from rig.core.errors import CatalogError, UsageError
 from rig.events.events import Ranked, RotationReason
 from rig.search.model import begin_search, model_of
 from rig.search.session import Finish, Rotate, Search, Strategy
-from rig.search.strategies import strategy
+from rig.search.strategies import BUILT_IN, strategy
 from rig.views.description import DESCRIPTORS, DescribedView
 from tests.fuzzing import examples
 from tests.rig.report.report_samples import moved
@@ -193,3 +194,10 @@ def test_hmm_rotates_only_as_far_as_the_cable_allows():
     search = begin_search(model_of(hbr.Views.concatenate([known, twin])), narrow, "hmm")
     _, step = added(search, known.descriptors[0], 0.0, table_deg=0.0)
     assert step == Finish(StopReason.NO_ROTATION_LEFT)
+
+
+def test_configuration_accepts_every_strategy_and_no_other_name():
+    for name in BUILT_IN:
+        assert IdentifyConfig(strategy=name).strategy == name
+    with pytest.raises(ValidationError, match="strategy"):
+        IdentifyConfig(strategy="golden")
