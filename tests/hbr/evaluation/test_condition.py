@@ -143,9 +143,11 @@ def test_size_and_prefilter_apply_to_all_images_and_each_noise_to_its_own() -> N
     assert np.abs(np.diff(enrolled.astype(int), axis=0)).max() < np.abs(np.diff(rough.astype(int), axis=0)).max() / 2
     assert (enrolled != query).any()
     noisy, grey = Condition(enrolled_noise=Noise(gaussian_variance=0.012)), np.full((64, 64, 3), 128, np.uint8)
-    first, second = (noisy.enrolled(grey, np.random.default_rng(seed)) for seed in (0, 1))
-    assert first.std() == pytest.approx(255 * 0.012**0.5, rel=0.05)
-    assert (first != second).any()
+    shown = [noisy.shown(grey, "a", number) for number in (0, 1)]
+    shown += [Condition(noise=Noise.parse("gn")).shown(grey, "a", number, seed) for number, seed in ((0, 0), (1, 0))]
+    for image in shown:
+        assert image.std() == pytest.approx(255 * 0.012**0.5, rel=0.05)
+    assert len({image.tobytes() for image in shown}) == 4  # each has its own
     np.testing.assert_array_equal(noisy.query(grey, np.random.default_rng(0)), grey)
 
 

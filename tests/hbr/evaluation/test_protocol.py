@@ -185,6 +185,7 @@ def test_oracle_has_a_larger_margin_than_a_fixed_step() -> None:
 def test_dense_searches_end_by_the_stopping_rule_and_methods_are_compared() -> None:
     methods = choose_methods(["dense", "dense-90", "dense-mutual", "hbr"])
     runs = Runs.concatenate([run(j, methods, FEW) for j in range(6)])
+    assert ((~np.isnan(runs.stated[:3, ..., 0])).sum(axis=-1) == 1).all()  # each search states its poses once
     runs.named[0] = True
     runs.outcome[0] = [OUTCOMES.index(Outcome.CONTINUE)] * 2 + [OUTCOMES.index(Outcome.FOUND)] * 2
     runs.outcome[0, 0, :, 2:] = OUTCOMES.index(Outcome.UNKNOWN)

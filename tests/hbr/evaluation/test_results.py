@@ -29,7 +29,8 @@ def test_curve_counts_hits_and_the_ten_best() -> None:
     first, second = result["curve"]
     assert [first[key] for key in ("views", "trials", "hits", "best10_hits")] == [1, 4, 1, 2]
     assert [second[key] for key in ("hits", "hit_rate", "best10_rate", "travelled_mean_deg")] == [2, 0.5, 0.75, 45]
-    assert first["hit_rate_low"] < 0.25 < first["hit_rate_high"]
+    assert (first["hit_rate_low"], first["hit_rate_high"]) == wilson(1, 4)
+    assert (first["best10_low"], first["best10_high"]) == wilson(2, 4)
 
 
 def test_only_hits_have_pose_errors() -> None:
