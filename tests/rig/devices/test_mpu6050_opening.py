@@ -52,7 +52,7 @@ def test_opening_resets_the_sensor(bench: ImuBench) -> None:
     [
         *((0x70, "MPU-6500", "mpu6500"), (0x71, "MPU-9250", "mpu9250"), (0x73, "MPU-9255", None)),
         *((0x72, "MPU-6050 clone", "mpu6050_clone"), (0x98, "MPU-6050 clone", "mpu6050_clone")),
-        *((0x42, "another chip", None), (0x00, "SDA is held low", None), (0xFF, "not connected", None)),
+        *((0x42, "DS3231", None), (0x00, "SDA is held low", None), (0xFF, "not connected", None)),
     ],
 )
 def test_wrong_chip_is_named_and_set_if_it_has_a_driver(who_am_i: int, likely: str, model: str | None) -> None:

@@ -160,6 +160,23 @@ def test_all_checks_end_under_every_fault_and_find_visible_ones(name, bench):
         assert not others
 
 
+@pytest.mark.parametrize(
+    ("topic", "code", "level", "spoil"),
+    [
+        ("servo", "supply", Severity.WARNING, lambda parts: parts.servo.set_voltage(13.8)),
+        ("servo", "supply", Severity.BAD, lambda parts: parts.servo.set_voltage(14.5)),
+        ("servo", "temperature", Severity.BAD, lambda parts: parts.servo.set_temperature(70)),
+        ("imu", "noisy", Severity.BAD, lambda parts: Faults(parts).schedule(Fault.parse("imu.garbage"))),
+        ("imu", "large_bias", Severity.BAD, lambda parts: setattr(parts.imu.inertial, "gyro_bias_dps", 30.0)),
+        ("imu", "wrong_gravity", Severity.BAD, lambda parts: setattr(parts.imu.inertial, "accel_bias_g", 0.7)),
+    ],
+)
+def test_values_beyond_a_limit_are_bad_and_close_to_it_a_warning(topic, code, level, spoil, bench):
+    set_up(bench)
+    spoil(bench.devices)
+    assert (code, level) in {(f.code, f.level) for f in bench.findings(topic)}
+
+
 # -- the IMU ----------------------------------------------------------------------------------------------------------
 
 
