@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import metadata
-from operator import methodcaller
 from typing import Any, Final
 
 from rig.core.control_characters import has_control_characters
@@ -122,10 +121,16 @@ def checked_texts(label: str | None, note: str | None) -> dict[str, str]:
 def as_json(values: JsonObject, what: str) -> dict[str, Any]:
     """Return the values as they will be read back from JSON. Numpy scalars become Python scalars."""
     try:
-        plain: dict[str, Any] = json.loads(json.dumps(dict(values), allow_nan=False, default=methodcaller("item")))
-    except (TypeError, ValueError, AttributeError) as error:
+        plain: dict[str, Any] = json.loads(json.dumps(dict(values), allow_nan=False, default=_scalar))
+    except (TypeError, ValueError) as error:
         raise UsageError(
             f"{what} cannot be stored as JSON: {error}.",
             next_step="Use text, finite numbers, true, false, None, lists and mappings.",
         ) from error
     return plain
+
+
+def _scalar(value: Any) -> object:
+    if getattr(value, "ndim", None) == 0:
+        return value.item()
+    raise TypeError(f"{value!r} is of type {type(value).__name__}")

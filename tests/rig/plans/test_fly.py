@@ -30,6 +30,7 @@ from rig.motion.move import MotionTimes
 from rig.motion.scan_speed import SpeedLimit, scan_speed, takes_in_motion
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import retake
+from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.saved_state import StateStore
 from rig.views.capture import RejectReason
 from rig.views.stream import FrameStream, after_middle_row_ns, middle_ns
@@ -133,7 +134,14 @@ def test_speed_is_the_fastest_that_the_limits_allow(settings: tuple[str, ...], l
     assert words in line(ScanStarted(speed.dps, speed.limit, speed.value, 0.0, 360.0))
 
 
-def test_trays_fly_if_the_camera_time_is_calibrated_and_single_objects_if_asked() -> None:
+def test_trays_fly_if_the_camera_time_is_calibrated_and_single_objects_if_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool | None] = []
+    monkeypatch.setattr("rig.plans.tray.enroll", lambda *_, fly, **__: asked.append(fly) or iter(()))
+    with flying(tmp_path) as (bench, catalog, _):
+        list(enroll_tray(bench, catalog, [TrayItem(2, "block")]))
+    assert asked == [True]
     calibrated, unknown = camera_time(World(), *SMALL), load_config(None, SMALL)
     assert [takes_in_motion(one, None, tray=True) for one in (calibrated, unknown)] == [True, False]
     assert [takes_in_motion(calibrated, fly) for fly in (None, True)] == [False, True]
@@ -189,10 +197,11 @@ def outcome(tmp_path: Path, *faults: str) -> tuple[RigError | None, list[Event],
 MISSING = ("lost_frames:rate=0.4", "doubled_frame", "frozen_frame")
 MISTIMED = ("stamp_jump:ms=15", "stamps_backwards", "stamp_jitter")
 UNRELIABLE = ("camera.slow:fps=10", "camera.intermittent")
+ABSENT = ("camera.stuck", "camera.delayed", "camera.off")
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("kinds", [MISTIMED, MISSING, UNRELIABLE])
+@pytest.mark.parametrize("kinds", [MISTIMED, MISSING, UNRELIABLE, ABSENT])
 def test_faulty_frames_leave_only_true_views(tmp_path: Path, kinds: tuple[str, ...]) -> None:
     error, events, worst = outcome(tmp_path, *(f"{kind}@{1.5 + 1.1 * i:.1f}s+0.8s" for i, kind in enumerate(kinds)))
     assert error is None
