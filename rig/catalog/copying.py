@@ -27,6 +27,7 @@ from rig.catalog.facts import Derived, Property
 from rig.catalog.images import Images
 from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
+from rig.catalog.upkeep import collect_garbage
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogBusy, CatalogError, CatalogUnavailable
@@ -139,6 +140,7 @@ def update_copy(catalog: Catalog) -> bool:
                 copy.delete(*(ours.keys() - theirs.keys()))
                 if changed := [name for name, found in theirs.items() if ours.get(name) != found]:
                     _fill(copy, CatalogSource(catalog, changed))
+                collect_garbage(copy, old=True)
             if is_of_it and list(_searched(copy).items()) == list(theirs.items()):  # in the same order
                 _sign(copy, own)
                 return ours != theirs
