@@ -295,11 +295,15 @@ def add_bench(routes: Routes, server: Server) -> None:
         from rig.report.motion import motion_report
 
         setup = server.setup
-        moves = stored(FileStore(setup.state_folder))
-        if not moves:
-            raise JobNotFound("No move of the table is stored.", next_step="Rotate it, then ask again.")
-        quiet_dps = setup.config.table.quiet_dps
-        return HTMLResponse(await long_work(lambda: motion_report(moves, bench=setup.bench, quiet_dps=quiet_dps)))
+
+        def page() -> str:
+            # A simulated bench without a folder has them in its memory.
+            moves = stored(FileStore(setup.state_folder)) or server.bench.call("moves")
+            if not moves:
+                raise JobNotFound("No move of the table is stored.", next_step="Rotate it, then ask again.")
+            return motion_report(moves, bench=setup.bench, quiet_dps=setup.config.table.quiet_dps)
+
+        return HTMLResponse(await long_work(page))
 
 
 async def _send_events(server: Server, socket: WebSocket) -> None:

@@ -23,6 +23,7 @@ from rig.core.json_form import plain
 from rig.core.notify import notify_of_job
 from rig.devices.servo import ServoState
 from rig.jobs.status import bench_facts
+from rig.motion.traces import stored
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.safety.stop_channel import StopAnswer, StopListener, listen
 from rig.safety.supervisor import stopped
@@ -112,6 +113,7 @@ class BenchWorker:
             "view": self._view,
             "picture": self._newest,
             "numbers": self._numbers,
+            "moves": lambda: [] if self._bench is None else stored(self._bench.state),
             "shelf": self._shelf_state,
             "thing": self._thing,
             "by_hand": self._by_hand,

@@ -15,7 +15,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound, StateNotStored
 from rig.doctor.examination import run_checks
 from rig.motion.arrival import QUIET_COUNTS
-from rig.safety.saved_state import SERVER_FOLDER, SESSION
+from rig.safety.saved_state import SERVER_FOLDER, SESSION, MemoryStore
 from rig.web.requests import GotoRequest, JobRequest
 from rig.web.setup import Setup
 from rig.web.work import JOBS
@@ -142,11 +142,13 @@ def test_latched_fault_is_in_the_status(serve):
     assert (status["state"], status["fault"]["code"]) == ("fault", job["error"]["code"])
 
 
-def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
+def test_angle_is_set_after_the_operator_looked_at_the_cable(serve, monkeypatch):
     served = serve()
     assert served.client.get("/api/v1/moves/report").status_code == 404
     served.run(kind="goto", angle_deg=90)
-    assert "from 0.0° to 90.0°" in served.client.get("/api/v1/moves/report").text
+    assert "from 0.0° to 90.0°" in (page := served.client.get("/api/v1/moves/report").text)
+    monkeypatch.setattr("rig.web.api_bench.FileStore", lambda _: MemoryStore())  # no file, as without state_dir
+    assert served.client.get("/api/v1/moves/report").text == page
     rest_deg = served.client.get("/api/v1/status").json()["table_deg"]
     assert rest_deg == pytest.approx(89.6, abs=0.3)  # friction holds the table short of its goal
     assert served.run(kind="reference")["error"]["code"] == 200
