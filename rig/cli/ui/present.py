@@ -67,7 +67,8 @@ def _cell(value: Any) -> str:
         case float():
             return number(value, ".2f")
         case dict():
-            return ", ".join(f"{key} {_cell(item)}" for key, item in value.items())
+            given = ((key, item) for key, item in value.items() if item is not None and item is not False)
+            return ", ".join(f"{key} {_cell(item)}" for key, item in given)
         case list() | tuple():
             return ", ".join(map(str, value))
         case _:

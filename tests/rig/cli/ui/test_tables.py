@@ -9,7 +9,7 @@ from rig.cli.ui.present import print_table
 
 def test_rows_in_a_pipe_are_aligned_and_complete(capsys: pytest.CaptureFixture[str]) -> None:
     rows = [
-        {"name": "mug", "views": 72, "angle_deg": -12.3, "note": "", "more": {}},
+        {"name": "mug", "views": 72, "angle_deg": -12.3, "note": "", "more": {"replace": False}},
         {"name": "漢字 [bold]", "views": 7, "angle_deg": None, "note": "x" * 300, "more": {"to_deg": 90.0}},
         {"name": "\x1b[31mred", "views": 0, "angle_deg": 4.0, "note": datetime(2026, 1, 2, tzinfo=UTC), "more": {}},
     ]
