@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.encoder import NAMES, Encoder, Step, _basis, evaluate
+from calibration.encoder import NAMES, Encoder, Step, evaluate
 from calibration.legs import Leg
 from calibration.procedure import Evaluation
 from rig.bench import calibrate
@@ -20,7 +20,9 @@ def drawn(seed: int, harmonics=(0.1, 0.1, 0.0, 0.0), direction: int = 1) -> list
     rng = np.random.default_rng(seed)
     true, _ = rests(rng, np.arange(25) * 30.0)
     shaft = direction * true
-    read = np.round((shaft + _basis(shaft, 360.0) @ harmonics) / COUNT_DEG) * COUNT_DEG
+    angle = np.radians(shaft)
+    error = np.array([np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)]).T @ harmonics
+    read = np.round((shaft + error) / COUNT_DEG) * COUNT_DEG
     gyro = np.diff(true) / 1.01 + rng.normal(0.0, 0.01, 24)
     return [
         Step(float(a), float(b), Leg(direction * float(b - a), float(g), 0.01))

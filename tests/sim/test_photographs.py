@@ -108,6 +108,17 @@ def test_table_of_a_file_gives_objects_angles_and_the_region(rig: Rig) -> None:
     assert done.exit_code == 0, done.output
     with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
         assert [view.region for view in catalog.object("cup").complete.views] == [(10, 5, 80, 90)] * 4
+    found = PhotographedObjects.read(PhotographOptions(source=Path("views.csv")))
+    assert found.fitted(load_config(None, ["view.roi=[10, 10, 50, 50]"])).view.roi == (10, 10, 50, 50)  # as it is set
+
+
+@pytest.mark.nightly
+def test_fault_replaces_the_object_by_another_one_of_the_photographs(rig: Rig) -> None:
+    save(Path("photographs"))
+    rig("enroll", "obj1", "--yes", *WITHOUT_NOISE, *put(faults='["object_moved:other=3:angle=0@move3"]'))
+    colours = [tuple(image[70, 50].tolist()) for _, image in stored_views("obj1")]
+    assert set(colours[:2]) == {COLOURS["obj1"]}
+    assert set(colours[4:]) == {COLOURS["obj2"]}  # the third one of the sorted names
 
 
 @pytest.mark.nightly
