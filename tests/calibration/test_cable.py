@@ -24,6 +24,7 @@ def test_ends_shown_by_hand_become_the_limits(simulated):
     assert limits_deg == pytest.approx([-600 + MARGIN_DEG, 500 - MARGIN_DEG], abs=2)
     config, _ = apply_results(s.bench.config, [event])
     assert config.table.limits_deg == tuple(limits_deg)
+    assert apply_results(config, [event]) == (config, ()), "the configuration says the same"
 
 
 @pytest.mark.parametrize(
