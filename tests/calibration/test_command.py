@@ -124,6 +124,9 @@ def test_show_and_history_list_results(rig, tmp_path, imu_calibration):
         "imu.mounting",
         "imu.rotation",
     ]
+    store(tmp_path, 0.0, name="imu.scale", rejections=(FEW,))
+    assert rig("calibrate", "report", "--out", "page.html").exit_code == 0
+    assert f"UTC: {FEW}" in (tmp_path / "page.html").read_text(encoding="utf-8"), "a newer attempt was rejected"
 
 
 @pytest.mark.nightly
