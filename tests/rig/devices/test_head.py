@@ -168,7 +168,7 @@ def test_silent_computer_switches_outputs_off(opened):
     assert opened.head.relay_closed
 
 
-@pytest.mark.parametrize("deadman_s", [0.25, pytest.param(2.0, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("deadman_s", [0.25, *(pytest.param(one, marks=pytest.mark.nightly) for one in (0.05, 2.0))])
 def test_deadman_has_the_configured_duration(deadman_s):
     with opened_head(noise=NoiseModel.none(), deadman_s=deadman_s) as h:
         h.imu.set_power(True)

@@ -110,6 +110,20 @@ def test_missing_sensor_raises_device_silent(bench: ImuBench, fault: int, imu: M
     assert (caught.value.evidence["attempts"], caught.value.evidence["errno"]) == (3, fault)
 
 
+def test_fifo_overflow_is_reported_and_cleared(bench: ImuBench, imu: Mpu6050) -> None:
+    bench.rotate(30.0)
+    bench.clock.sleep(1.5)
+    overflowed = imu.read_samples()
+    assert overflowed.time_ns.size == overflowed.gyro_dps.size == 0
+    assert 298 <= overflowed.lost <= 303
+    assert imu.statistics.overflows == 1
+    bench.clock.sleep(0.2)
+    after = imu.read_samples()
+    assert after.lost == 0
+    assert 38 <= after.time_ns.size <= 41
+    assert after.gyro_dps == pytest.approx(np.tile([0, 0, 30.0], (after.time_ns.size, 1)), abs=0.01)
+
+
 @pytest.mark.parametrize("pause_ms", [140, 240])
 def test_fifo_that_overflows_between_count_and_data_gives_no_corrupt_samples(
     bench: ImuBench, pause_ms: int, imu: Mpu6050
