@@ -19,7 +19,7 @@ from rig.devices.picamera2_capture import import_picamera2
 from rig.devices.v4l2 import VideoMode, choose_mode
 from rig.doctor.computer import access, i2c_command
 from rig.doctor.examination import Check, DoctorContext
-from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, Severity, bad, fine, of_error, warning
 from rig.doctor.imu import FoundImu, not_opened, rig_head, scan_imus, unusable
 from rig.doctor.servo import duplicate_id, foreign_bytes
 from rig.doctor.servo_scan import BAUD_RATES, scan_servos
@@ -149,6 +149,8 @@ class DeviceScan:
                 if (reason := unusable(context.computer, found)) is None:
                     self.candidates["IMU"].append(imu_settings(found))
                     yield fine("imu_found", "{found}", found=found, bus=found.bus, address=found.address)
+                elif reason.code == "no_driver":  # it may be a clock beside the sensor
+                    yield replace(reason, level=Severity.WARNING)
                 elif reason.code not in reported:
                     yield reason
                 # A bus that fails does so at each address, and is reported once.
