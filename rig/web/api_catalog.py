@@ -262,7 +262,7 @@ def add_results(routes: Routes, server: Server) -> None:
     @routes.watch.get("/results/charts/{name}", tags=["results"], response_class=Drawing)
     def draw_results(
         name: Literal["days", "drift"],
-        zone_min: Annotated[int, Query(ge=-1440, le=1440, description="minutes by which the clock is before UTC")] = 0,
+        zone_min: Annotated[int, Query(ge=-1440, le=1440, description="minutes that the clock is ahead of UTC")] = 0,
     ) -> Response:
         """Draw the answers a day of two weeks, or the scores of the found objects and the last empty-table image."""
         with server.catalog.open_to_read() as catalog:
