@@ -248,6 +248,7 @@ def test_dense_search_shows_its_decisions() -> None:
     page = Page(render_report("Search", "", [], [recorded(Record(), searching_densely())], meta=META))
     assert [one.strip() for one in page.texts].count("not enrolled") == 3  # in the table of each view
     assert "Not confident yet: 60.0 %, and 95.0 % ends the search." in page.text
+    assert "Most objects were enrolled without an empty-table image, so the search does not use it" in page.text
     assert page.text.count("distinguishes mug-white from mug-star, similarity 0.50") == 2
     assert ["mug-white", "60.0 %", "0.900"] in [row for table in page.tables for row in table]
 

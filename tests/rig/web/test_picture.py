@@ -1,5 +1,8 @@
 """The live picture: its age tells that the camera gives no new one."""
 
+import asyncio
+from base64 import b64encode
+
 import numpy as np
 
 from rig.web.picture import LivePicture
@@ -30,3 +33,10 @@ def test_idle_camera_is_asked_only_while_a_page_looks():
     assert picture.wanted
     clock.sleep(6.0)
     assert not picture.wanted
+
+
+def test_frame_that_is_known_already_is_shown_without_being_sent_again(served, monkeypatch):
+    monkeypatch.setattr("rig.web.server.PICTURE_S", 0.0)
+    answers = iter([{"number": 1, "jpeg": b64encode(b"frame").decode(), "age_s": 0.1}, {"jpeg": "", "age_s": 0.4}])
+    monkeypatch.setattr(served.server.bench, "call", lambda *_, **__: next(answers))
+    assert [asyncio.run(served.server.picture()) for _ in range(2)] == [(b"frame", 0.1), (b"frame", 0.4)]
