@@ -65,6 +65,21 @@ def test_missing_servo_unknown_model_and_busy_bench_are_errors():
         assert not bench.sent
 
 
+def test_rate_that_the_adapter_lacks_is_rejected_before_writing():
+    with unopened() as bench, single_servo(bench.context) as servo:
+
+        class Slow(type(servo._wire)):
+            def __setattr__(self, name, value):
+                if name == "baudrate" and value > 1_000_000:
+                    raise ValueError(value)
+                super().__setattr__(name, value)
+
+        servo._wire.__class__ = Slow
+        with pytest.raises(UsageError, match="adapter has no baud rate 4500000"):
+            servo.set_baud(4_500_000)
+        assert WRITE not in bench.instructions
+
+
 def test_invalid_rate_is_rejected_before_writing():
     with unopened() as bench, single_servo(bench.context) as servo:
         with pytest.raises(UsageError) as caught:
