@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session as Transaction
@@ -118,8 +118,8 @@ def _about(transaction: Transaction) -> dict[str, Any]:
 def update_copy(catalog: Catalog) -> bool:
     """Bring the local copy up to date; return whether anything had changed.
 
-    Only new and deleted objects are brought over. A copy that is damaged, of another catalog, or different in another
-    way (an object has another name, or was described again) is made again and takes the place of the former one.
+    Only new, deleted and renamed objects and other texts are brought over. A copy that is damaged, of another catalog,
+    or different in another way (an object was described again) is made again and takes the place of the former one.
 
     Raises `CatalogDamaged`: the catalog is not as it was stored; the copy stays as it is. `CatalogError`,
     `CatalogBusy`: one of them cannot be used, or another program makes the copy.
@@ -137,8 +137,15 @@ def update_copy(catalog: Catalog) -> bool:
                 is_of_it = about.items() <= _about(transaction).items()
             ours = _searched(copy)
             if is_of_it and ours != theirs:
-                copy.delete(*(ours.keys() - theirs.keys()))
-                if changed := [name for name, found in theirs.items() if ours.get(name) != found]:
+                names = {found.seal: name for name, found in ours.items()}
+                for name, found in theirs.items():
+                    before = names.get(found.seal)
+                    if before is not None and (before, *ours[before][:2]) != (name, *found[:2]):
+                        copy.rename(before, name)
+                        copy.set_texts(name, label=found.label, note=found.note)
+                now = _searched(copy)
+                copy.delete(*(now.keys() - theirs.keys()))
+                if changed := [name for name, found in theirs.items() if now.get(name) != found]:
                     _fill(copy, CatalogSource(catalog, changed))
                 collect_garbage(copy, old=True)
             if is_of_it and list(_searched(copy).items()) == list(theirs.items()):  # in the same order
@@ -171,15 +178,27 @@ def only_program(lock: Path, doing: str) -> Iterator[None]:
         os.close(held)
 
 
-def _searched(catalog: Catalog) -> dict[str, tuple[object, ...]]:
-    """Return what searches read of each object by its name: texts, seal, and digests of what is computed from it."""
+class _Searched(NamedTuple):
+    """What searches read of an object: its texts, its seal, and digests of what is computed from it."""
+
+    label: str
+    note: str
+    seal: str
+    computed: list[object] | None
+
+
+def _searched(catalog: Catalog) -> dict[str, _Searched]:
+    """Return what searches read of each object by its name."""
     with catalog.reading() as state:
         computed = defaultdict[str, list[object]](list)
         columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.sha256)
         for seal, *row in state.transaction.execute(columns.order_by(Derived.seal, Derived.what)):
             computed[seal].append(row)
         texts = {line.object_id: (line.label or "", line.note or "") for line in state.in_use()}
-        return {one.name: (*texts[one.object_id], one.seal, computed.get(one.seal)) for one in state.used(checked=True)}
+        return {
+            one.name: _Searched(*texts[one.object_id], one.seal, computed.get(one.seal))
+            for one in state.used(checked=True)
+        }
 
 
 def _fill(copy: Catalog, source: CatalogSource) -> None:

@@ -71,7 +71,9 @@ def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace) -> None
         catalog.set_texts("cup", label="kitchen")
         fill(catalog, "tin", 3, 20, replace=True, empty_table=image(99))
         record_result(catalog, new_result(), image(1))
+        made = place.copy_folder.stat().st_ino
         assert update_copy(catalog)
+        assert place.copy_folder.stat().st_ino == made  # the copy was not made again as a whole
         with same_copy(place, catalog) as copy:
             assert derived.views(copy).object_names == ("cup", "tin")
             assert copy.database.images.names() == {derived.empty_tables(catalog).newest}
