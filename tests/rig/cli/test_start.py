@@ -10,7 +10,7 @@ import pytest
 
 RIG = Path(sys.executable).with_name("rig")
 SITE = """
-import atexit, os, signal, sys
+import atexit, os, signal, sys, threading
 
 def interrupt(*_):
     os.kill(os.getpid(), signal.SIGINT)
@@ -24,13 +24,18 @@ class Finder:
 moment = os.environ["RIG_TEST_MOMENT"]
 if moment == "atexit":
     atexit.register(interrupt)
+elif moment == "threads":
+    shutdown = threading._shutdown
+    threading._shutdown = lambda: (interrupt(), shutdown())
 else:
     sys.meta_path.insert(0, Finder())
 """
 """Python imports this at its start. It sends SIGINT when a module is to be imported, or at a moment of the end."""
 
 
-def interrupted(folder: Path, moment: str, *words: str) -> subprocess.CompletedProcess:
+def interrupted(
+    folder: Path, moment: str, *words: str, handler: object = signal.SIG_DFL
+) -> subprocess.CompletedProcess:
     (folder / "sitecustomize.py").write_text(SITE, encoding="utf-8")
     return subprocess.run(
         [RIG, *words],
@@ -38,7 +43,7 @@ def interrupted(folder: Path, moment: str, *words: str) -> subprocess.CompletedP
         cwd=folder,
         capture_output=True,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=lambda: signal.signal(signal.SIGINT, handler),
     )
 
 
@@ -46,7 +51,7 @@ def interrupted(folder: Path, moment: str, *words: str) -> subprocess.CompletedP
     ("moment", "words"),
     [
         ("rig.cli.main", "--version"),
-        ("rig.bench", "goto 90 --bench sim"),  # the command has begun
+        ("sim.bench", "goto 90 --bench sim"),  # the command has begun
         *(
             pytest.param(moment, "goto 90 --bench sim", marks=pytest.mark.nightly)
             for moment in ("typer", "rig.core.signals", "rig.cli.bench.table", "numpy", "cv2")
@@ -60,10 +65,25 @@ def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words,
     assert "°" not in done.stdout  # the table has not moved
 
 
-def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(tmp_path):
-    done = interrupted(tmp_path, "atexit", "--version")
+@pytest.mark.parametrize(
+    ("moment", "words"),
+    [
+        ("atexit", "--version"),
+        *(pytest.param("threads", words, marks=pytest.mark.nightly) for words in ("config show", "--version")),
+    ],
+)
+def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, words, tmp_path):
+    done = interrupted(tmp_path, moment, *words.split())
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout
+
+
+@pytest.mark.nightly
+def test_ignored_ctrl_c_stays_ignored_until_a_command_begins(tmp_path):
+    done = interrupted(tmp_path, "typer", "config", "show", handler=signal.SIG_IGN)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = interrupted(tmp_path, "sim.bench", "goto", "90", "--bench", "sim", handler=signal.SIG_IGN)
+    assert (done.returncode, done.stderr.split()[0]) == (130, "Interrupted.")
 
 
 PLAIN = """
@@ -89,6 +109,16 @@ def new(settings):
     Part()
     threading.Event().wait(60)
 """
+SLOW = (
+    """
+usual = threading.Thread.start
+def start(thread):
+    usual(thread)
+    threading.Event().wait(0.1)
+threading.Thread.start = start
+"""
+    + DEL
+)
 
 
 @pytest.mark.parametrize(
@@ -97,6 +127,9 @@ def new(settings):
         pytest.param(PLAIN, "closed\n", "", id="command-of-a-package"),
         pytest.param(SET_NAME, "", "Interrupted.\n", id="python-3.11-makes-another-exception-of-it"),
         pytest.param(DEL, "", "Interrupted.\n", id="python-drops-the-exception"),
+        pytest.param(
+            SLOW, "", "Interrupted.\n", id="python-drops-the-exception-on-a-busy-computer", marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_ctrl_c_unwinds_each_command(command, output, errors):
