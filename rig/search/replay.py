@@ -7,7 +7,9 @@ from typing import Any, Final
 
 from hbr.dense.pixel_fit import PixelFit
 from hbr.dense.session import answered
+from rig.core.errors import ReplayMismatch, RunIncomplete
 from rig.core.json_form import plain
+from rig.core.phrases import counted
 from rig.events.events import (
     Accepted,
     Decided,
@@ -50,6 +52,32 @@ class ReplayCheck:
     decisions: int = 0
     is_complete: bool = False
     differences: list[ReplayDifference] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        return f"Computed again: {counted(self.views, 'descriptor')} and {counted(self.decisions, 'decision')}."
+
+
+def confirm(run: SavedRun) -> ReplayCheck:
+    """Check a run, which must be whole, and of which every number must be computed as it was saved.
+
+    Raises `ReplayMismatch`: numbers differ. `RunIncomplete`: the run has no end. `UsageError`: as for `check`.
+    """
+    with run.damage():
+        found = check(run)
+    if found.differences:
+        raise ReplayMismatch(
+            f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {found}",
+            next_step="Check whether the files of the run were changed. If not, this version of the program decides "
+            f"differently from {run.about.software}, which saved the run.",
+            evidence={"differences": [str(one) for one in found.differences]},
+        )
+    if not found.is_complete:
+        raise RunIncomplete(
+            f"The saved run has no end: {'its last line is cut off' if run.is_cut else 'the answer is missing'}. "
+            f"{found} All are as saved.",
+            next_step="Search again, or take the run from a backup. The images and decisions so far are good.",
+        )
+    return found
 
 
 def check(run: SavedRun) -> ReplayCheck:

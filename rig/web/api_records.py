@@ -19,6 +19,7 @@ from rig.core.json_form import plain
 from rig.core.masking import masked
 from rig.core.next_steps import Do
 from rig.events.events import DESCRIBED, JsonEvent, event_dict
+from rig.search.replay import ReplayCheck, confirm
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.answers import ListOf
 from rig.web.requests import RequestBody
@@ -149,6 +150,11 @@ def add_records(routes: Routes, server: Server) -> None:
         from rig.report.report import run_report
 
         return HTMLResponse(await long_work(lambda: run_report(load(name))))
+
+    @routes.watch.post("/runs/{name}/check", tags=["runs"])
+    async def check_run(name: str) -> ReplayCheck:
+        """Compute every decision of a saved run again from its images; a difference is an error."""
+        return await long_work(lambda: confirm(load(name)))
 
     @routes.watch.get("/calibrations", tags=["bench"])
     def list_calibrations() -> Calibrations:

@@ -9,7 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.live import LiveView
 from rig.cli.ui.present import first
 from rig.cli.ui.settings import Settings
-from rig.core.errors import ReplayMismatch, RunIncomplete, UsageError
+from rig.core.errors import ReplayMismatch, UsageError
 from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import counted, short
@@ -19,8 +19,8 @@ from rig.report import write_report
 from rig.report.motion import motion_report
 from rig.report.report import run_report
 from rig.safety.saved_state import FileStore
-from rig.search.replay import check as check_run
-from rig.search.saved_run import SavedRun, load_run
+from rig.search.replay import confirm
+from rig.search.saved_run import load_run
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")]
 SHOWN: Final = 3
@@ -41,7 +41,13 @@ def replay(
     """
     saved = load_run(run)
     if check:
-        _check(settings, saved)
+        try:
+            found = confirm(saved)
+        except ReplayMismatch as error:
+            if not settings.json:
+                error.evidence["differences"] = first([short(one, 120) for one in error.evidence["differences"]], SHOWN)
+            raise
+        settings.say(f"{found} All are as saved.", plain(found))
         return
 
     if not settings.json:
@@ -90,26 +96,3 @@ def _motion(settings: Settings) -> str:
             next_step=(Do.GOTO(), "A simulated bench stores its moves if state_dir is set."),
         )
     return motion_report(moves, bench=bench, quiet_dps=config.table.quiet_dps)
-
-
-def _check(settings: Settings, saved: SavedRun) -> None:
-    with saved.damage():
-        found = check_run(saved)
-    done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."
-    if found.differences:
-        listed = [str(one) for one in found.differences]
-        if not settings.json:
-            listed = first([short(one, 120) for one in listed], SHOWN)
-        raise ReplayMismatch(
-            f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {done}",
-            next_step="Check whether the files of the run were changed. If not, this version of the program decides "
-            f"differently from {saved.about.software}, which saved the run.",
-            evidence={"differences": listed},
-        )
-    if not found.is_complete:
-        raise RunIncomplete(
-            f"The saved run has no end: {'its last line is cut off' if saved.is_cut else 'the answer is missing'}. "
-            f"{done} All are as saved.",
-            next_step="Search again, or take the run from a backup. The images and decisions so far are good.",
-        )
-    settings.say(f"{done} All are as saved.", plain(found))

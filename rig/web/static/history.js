@@ -53,7 +53,11 @@ async function open(one) {
     one.image ? picture(`${API}/results/${one.id}/image?full=true`, "The first view", "First view") : h("p", { class: "soft" }, "No image was recorded."),
     one.object ? picture(`${API}/pose-picture?object=${at(one.object)}`, `${one.object} as enrolled`, one.object, " as enrolled") : h("span"));
   const facts = h("p", { class: "small soft" }, [when(one.time_utc), personOf(one.operator), counted(one.views, "view"), one.sample && `sample ${one.sample}`, one.correction_reason && `corrected by ${one.corrected_by}: ${one.correction_reason}`].filter(Boolean).join(", "));
-  const links = run ? [h("a", { class: "button", href: `${API}/runs/${run}/report`, target: "_blank" }, "Open the report")] : [];
+  const check = async () => {
+    const { views, decisions } = await request("POST", `/runs/${run}/check`);
+    toast(`Computed again: ${counted(views, "view")} and ${counted(decisions, "decision")}. All are as saved.`);
+  };
+  const links = run ? [h("div", { class: "row" }, h("a", { class: "button", href: `${API}/runs/${run}/report`, target: "_blank" }, "Open the report"), h("button", { class: "quiet", onclick: () => act(check) }, "Compute it again"))] : [];
   const choice = await ask(`Answer ${one.id}: ${answerWords(one)}`, [pictures, facts, ...links], canOperate() ? [["correct", "Correct it", "quiet"]] : []);
   if (choice === "correct") await correct(one);
 }

@@ -70,6 +70,8 @@ def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     run = served.client.get(f"/api/v1/runs/{job['run']}").json()
     assert run["events"][-1]["event"] == "identified"
     assert "mug-white" in served.client.get(f"/api/v1/runs/{job['run']}/report").text
+    checked = served.client.post(f"/api/v1/runs/{job['run']}/check").json()
+    assert (checked["differences"], checked["views"], checked["is_complete"]) == ([], job["result"]["views"], True)
     (answer,) = served.client.get("/api/v1/results?sample=S-1").json()["items"]
     assert (answer["object"], answer["operator"]) == ("mug-white", "local")
     fixed = {"object": "lamp", "reason": "read the label"}
