@@ -119,7 +119,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     def summary(self, name: str) -> ObjectSummary:
         """Return an object without its enrollments and views; errors as for `object`."""
         with self.reading() as found:
-            return found.summaries([found.find(name)])[0]
+            return found.summary(found.find(name))
 
     def object(self, name: str) -> ObjectDetails:
         """Return an object with its enrollments and views.
@@ -129,7 +129,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.reading() as found:
             known = found.find(name)
             found.check_present(known.object_id)
-            return ObjectDetails(found.summaries([known])[0], tuple(found.enrollments_of(known.object_id)))
+            return ObjectDetails(found.summary(known), tuple(found.enrollments_of(known.object_id)))
 
     def first_views(self) -> dict[str, int]:
         """Return the id of one view of each object in use, to show the object by."""

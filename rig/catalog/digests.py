@@ -1,6 +1,7 @@
 """Comparison of the digests of many rows, as the database stores them: without making objects of them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from functools import lru_cache
 from typing import Any, Final
 
 from sqlalchemy import (
@@ -10,13 +11,16 @@ from sqlalchemy import (
     DateTime,
     Float,
     Integer,
+    Select,
     Text,
+    bindparam,
     cast,
     func,
     select,
     type_coerce,
 )
 from sqlalchemy.orm import Session as Transaction
+from sqlalchemy.orm import aliased
 from sqlalchemy.types import NullType
 
 from rig.catalog.columns import stored_type
@@ -39,6 +43,25 @@ def damaged_lines(transaction: Transaction, end: int, digest: str) -> Iterator[i
     yield from range(last + 1, end)
     if (last, before) != (end, digest):
         yield max(last, end)
+
+
+def wrong_lines(transaction: Transaction, ids: Collection[int]) -> list[int]:
+    """Return which of these lines of the log are not as they were written after the line before each."""
+    wrong: list[int] = []
+    for part in portions(sorted(ids), 500):
+        rows = transaction.execute(_lines(_is_postgres(transaction)), {"ids": part})
+        wrong += [number for number, digest, *row in rows if digest != sha256_of(tuple(row))]
+    return wrong
+
+
+@lru_cache(maxsize=2)  # each view that is enrolled asks it, and to build the statement takes longer than to execute it
+def _lines(is_postgres: bool) -> Select[Any]:
+    before = aliased(Entry)
+    return (
+        select(Entry.id, Entry.digest, func.coalesce(before.digest, ""), *_raw(is_postgres, Entry))
+        .outerjoin(before, before.id == Entry.id - 1)
+        .where(Entry.id.in_(bindparam("ids", expanding=True)))
+    )
 
 
 def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None]) -> Iterator[int]:

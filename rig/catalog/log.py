@@ -7,7 +7,7 @@ import os
 import pwd
 import re
 import socket
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import datetime
@@ -18,7 +18,6 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import damaged
 from rig.catalog.facts import Action, Entry, Property, digest_of
-from rig.catalog.jobs import portions
 from rig.catalog.records import as_json, this_software
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged
@@ -119,16 +118,6 @@ def check_complete(transaction: Transaction) -> None:
             "Lines of the catalog's log are missing or were changed.",
             next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
         )
-
-
-def wrong_lines(transaction: Transaction, lines: Iterable[Entry]) -> list[Entry]:
-    """Return which of these lines are not as they were written after the line before each."""
-    wrong: list[Entry] = []
-    for part in portions(lines, 500):
-        numbers = [line.id - 1 for line in part]
-        before = dict(transaction.execute(select(Entry.id, Entry.digest).where(Entry.id.in_(numbers))).all())
-        wrong += [line for line in part if line.digest != digest_of(line, before.get(line.id - 1, ""))]
-    return wrong
 
 
 def shown(entry: Entry) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, and_, func, or_, select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import log
+from rig.catalog import digests, log
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged, image_name
 from rig.catalog.facts import Action, Entry
@@ -334,8 +334,8 @@ def _find(transaction: Transaction, result_id: int) -> Result:
 def _load(transaction: Transaction, wanted: ColumnElement[bool]) -> list[Result]:
     """Return the answers among these lines of the log, with the corrections among them."""
     lines = transaction.scalars(select(Entry).where(wanted).order_by(Entry.id)).all()
-    if wrong := log.wrong_lines(transaction, lines):
-        numbers = [line.result for line in wrong]
+    if wrong := digests.wrong_lines(transaction, [line.id for line in lines]):
+        numbers = [line.result for line in lines if line.id in wrong]
         raise CatalogDamaged(
             f"Result {numbers[0]} in the catalog changed after it was recorded.",
             next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),

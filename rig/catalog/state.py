@@ -37,14 +37,52 @@ CURRENT: Final = {
 """An object has one enrollment of each such status. What becomes of it if it gets another one."""
 
 
-def _last_lines(sets: InstrumentedAttribute[Any], of: InstrumentedAttribute[Any]) -> Select[Any]:
-    """Return the last lines of the log that set this column, of each object or enrollment."""
-    return select(Entry).where(Entry.id.in_(select(func.max(Entry.id)).where(sets.is_not(None)).group_by(of)))
+class ObjectLine(NamedTuple):
+    """What a line of the log says about the state of an object."""
+
+    id: int
+    object_id: int
+    object_name: str | None
+    label: str | None
+    note: str | None
+    created_utc: datetime | None
+    time_utc: datetime
+    deleted: bool
+
+
+AnyLine = ObjectLine | Entry
+"""A line that gives an object its state."""
+
+
+class StatusLine(NamedTuple):
+    """What a line of the log says about the status of an enrollment."""
+
+    id: int
+    enrollment_id: int
+    object_id: int
+    object_name: str | None
+    status: EnrollmentStatus
+    finished_utc: datetime | None
+    seal: str | None
+
+
+def _last_lines(
+    kind: type[NamedTuple],
+    sets: InstrumentedAttribute[Any],
+    of: InstrumentedAttribute[Any],
+    *conditions: ColumnElement[bool],
+) -> Select[Any]:
+    """Return the last lines of the log that set this column, of each object or enrollment, or of some of them.
+
+    Only these columns are read: an object of each whole line takes several times as long.
+    """
+    last = select(func.max(Entry.id)).where(sets.is_not(None), *conditions).group_by(of)
+    return select(*(getattr(Entry, name) for name in kind._fields)).where(Entry.id.in_(last)).order_by(of)
 
 
 # Statements that many others ask for: to build one takes longer than to execute it.
-_STATES: Final = _last_lines(Entry.deleted, Entry.object_id).order_by(Entry.object_id)
-_STATUSES: Final = _last_lines(Entry.status, Entry.enrollment_id)
+_STATES: Final = _last_lines(ObjectLine, Entry.deleted, Entry.object_id)
+_STATUSES: Final = _last_lines(StatusLine, Entry.status, Entry.enrollment_id)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,25 +147,25 @@ class State:
         self.transaction, self._clock = transaction, clock
 
     @cached_property
-    def objects(self) -> dict[int | None, Entry]:
+    def objects(self) -> dict[int, ObjectLine]:
         """The lines that give each object its present state, by its id, in the order in which they were added."""
-        return {line.object_id: line for line in self.transaction.scalars(_STATES)}
+        return {row.object_id: ObjectLine(*row) for row in self.transaction.execute(_STATES)}
 
     @cached_property
-    def statuses(self) -> dict[int | None, Entry]:
+    def statuses(self) -> dict[int, StatusLine]:
         """The lines that give each enrollment its present status, by its id."""
-        return {line.enrollment_id: line for line in self.transaction.scalars(_STATUSES)}
+        return {row.enrollment_id: StatusLine(*row) for row in self.transaction.execute(_STATUSES)}
 
     def check(self) -> None:
         """Raise `CatalogDamaged` if a line of the state is missing or not as it was written."""
         log.check_complete(self.transaction)
         check_lines(self.transaction, (*self.objects.values(), *self.statuses.values()))
 
-    def in_use(self) -> list[Entry]:
+    def in_use(self) -> list[ObjectLine]:
         """Return the states of the objects in use, unchecked."""
         return [line for line in self.objects.values() if not line.deleted]
 
-    def deleted(self) -> list[Entry]:
+    def deleted(self) -> list[ObjectLine]:
         """Return the states of the deleted objects that `collect_garbage` has not removed, unchecked."""
         stored = set(self.transaction.scalars(select(Enrollment.object_id)))
         return [line for line in self.objects.values() if line.deleted and line.object_id in stored]
@@ -140,9 +178,11 @@ class State:
         Raises `ObjectNotFound`: there is no such object. The next step lists similar names.
         """
         name = clean_name(name)
-        among = self.deleted() if deleted else self.in_use()
-        if (found := self._named(name, among)) is not None:
+        if not deleted and (found := self.named(name)) is not None:
             return found
+        among = self.deleted() if deleted else self.in_use()
+        if own := [line for line in among if line.object_name == name]:
+            return self.by_id(max(own).object_id)
         self.check()  # its name or its state may have been changed
         by_folded = {str(line.object_name).casefold(): str(line.object_name) for line in among}
         near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
@@ -155,11 +195,10 @@ class State:
 
     def named(self, name: str) -> Entry | None:
         """Return the state of the object in use with this name, which is clean; None if there is none."""
-        return self._named(name, self.in_use())
-
-    def _named(self, name: str, among: Sequence[Entry]) -> Entry | None:
-        found = [line for line in among if line.object_name == name]
-        last = max(found, key=lambda line: line.id, default=None)
+        ids = select(Entry.object_id).where(Entry.object_name == name, Entry.deleted.is_not(None)).distinct()
+        lines = [self._last(Entry.deleted, Entry.object_id, object_id) for object_id in self.transaction.scalars(ids)]
+        own = [line for line in lines if line and line.object_name == name and not line.deleted]
+        last = max(own, key=lambda line: line.id, default=None)
         return last and self._checked(last)
 
     def by_id(self, object_id: int | None) -> Entry:
@@ -183,7 +222,7 @@ class State:
         check_lines(self.transaction, [line])
         return line
 
-    def id_of(self, known: Entry | None) -> int:
+    def id_of(self, known: AnyLine | None) -> int:
         """Return the id of an object; for None that of the one which the next line of the log adds."""
         return known.object_id if known and known.object_id else log.head(self.transaction)[0] + 1
 
@@ -199,15 +238,34 @@ class State:
                 next_step=("Choose another name, or", Do.RENAME(name=name)),
             )
 
-    def summaries(self, states: Sequence[Entry]) -> list[ObjectSummary]:
+    def summaries(self, states: Sequence[ObjectLine]) -> list[ObjectSummary]:
         """Return summaries of the objects with these states. All lines are checked."""
         self.check()
+        return self._summaries(states, self.statuses.values())
+
+    def summary(self, known: Entry) -> ObjectSummary:
+        """Return the summary of one object. The lines about it are checked."""
+        statuses = self._statuses_of(known.object_id)
+        log.check_complete(self.transaction)
+        check_lines(self.transaction, [known, *statuses])
+        ids = [line.enrollment_id for line in statuses]
+        return self._summaries([known], statuses, ids)[0]
+
+    def _summaries(
+        self,
+        states: Sequence[AnyLine],
+        statuses: Iterable[StatusLine],
+        enrollment_ids: Collection[int] | None = None,
+    ) -> list[ObjectSummary]:
         # Two statements for all objects together, and not one for each object.
         counts = select(View.enrollment_id, func.count()).group_by(View.enrollment_id)
         lengths = select(Enrollment.id, func.json_array_length(Enrollment.planned_azimuth_deg))
+        if enrollment_ids is not None:
+            counts = counts.where(View.enrollment_id.in_(enrollment_ids))
+            lengths = lengths.where(Enrollment.id.in_(enrollment_ids))
         taken: dict[int | None, int] = dict(self.transaction.execute(counts).all())
         planned: dict[int | None, int] = dict(self.transaction.execute(lengths).all())
-        current = {(line.object_id, line.status): line for line in self.statuses.values()}
+        current: dict[Any, StatusLine] = {(line.object_id, line.status): line for line in statuses}
         found = []
         for one in states:
             done = current.get((one.object_id, EnrollmentStatus.COMPLETE))
@@ -278,7 +336,8 @@ class State:
             .execution_options(populate_existing=True)
         )
         rows = self.transaction.scalars(wanted).all()
-        endings = [self.statuses.get(one.id) for one in rows]
+        known = self._statuses(Entry.enrollment_id.in_([one.id for one in rows]))
+        endings = [known.get(one.id) for one in rows]
         check_lines(self.transaction, filter(None, endings))
         wrong = self.damaged_enrollments([one.id for one in rows]) if rows else {}
         found = []
@@ -291,15 +350,23 @@ class State:
 
     def enrollments_of(self, object_id: int | None) -> list[EnrollmentState]:
         """Return the enrollments of an object: by their own rows, and by the log."""
-        return self.enrollments(or_(Enrollment.object_id == object_id, Enrollment.id.in_(self._logged(object_id))))
+        logged = [line.enrollment_id for line in self._statuses_of(object_id)]
+        return self.enrollments(or_(Enrollment.object_id == object_id, Enrollment.id.in_(logged)))
 
-    def of_status(self, known: Entry, status: EnrollmentStatus) -> EnrollmentState | None:
+    def of_status(self, known: AnyLine, status: EnrollmentStatus) -> EnrollmentState | None:
         """Return the enrollment of an object that is complete or in progress; None if there is none."""
-        own = {number for number in self._logged(known.object_id) if self.statuses[number].status is status}
+        own = [line.enrollment_id for line in self._statuses_of(known.object_id) if line.status is status]
         return next(iter(self.enrollments(Enrollment.id.in_(own))), None) if own else None
 
-    def _logged(self, object_id: int | None) -> list[int | None]:
-        return [number for number, line in self.statuses.items() if line.object_id == object_id]
+    def _statuses(self, *conditions: ColumnElement[bool]) -> dict[int, StatusLine]:
+        wanted = _last_lines(StatusLine, Entry.status, Entry.enrollment_id, *conditions)
+        return {row.enrollment_id: StatusLine(*row) for row in self.transaction.execute(wanted)}
+
+    def _statuses_of(self, object_id: int | None) -> list[StatusLine]:
+        """Return the lines that give the enrollments of an object their present status."""
+        ids = select(Entry.enrollment_id).where(Entry.object_id == object_id, Entry.status.is_not(None))
+        found = self._statuses(Entry.enrollment_id.in_(ids)).values()
+        return [line for line in found if line.object_id == object_id]
 
     def unfinished(self, known: Entry) -> EnrollmentState:
         """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
@@ -329,7 +396,7 @@ class State:
                 ),
             )
 
-    def end_current(self, known: Entry, status: EnrollmentStatus) -> None:
+    def end_current(self, known: AnyLine, status: EnrollmentStatus) -> None:
         """End the enrollment of an object that is complete or in progress, if there is one: another replaces it."""
         before = self.of_status(known, status)
         if before is not None:
@@ -346,11 +413,12 @@ class State:
         """
         owners = select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.id)
         rows = dict(self.transaction.execute(owners if ids is None else owners.where(Enrollment.id.in_(ids))).all())
-        endings = {number: self.statuses.get(number) for number in rows}
+        known = self.statuses if ids is None else self._statuses(Entry.enrollment_id.in_(rows))
+        endings = {number: known.get(number) for number in rows}
         seals = {number: None if line is None else line.seal for number, line in endings.items()}
         wrong = set(digests.damaged_enrollments(self.transaction, seals))
         wrong |= {number for number, line in endings.items() if line is None or line.object_id != rows[number]}
-        names = {number: line.object_name for number, line in self.objects.items()}
+        names = {number: line.object_name for number, line in self.objects.items()} if wrong else {}
         return {number: names.get(owner) for number, owner in rows.items() if number in wrong}
 
     def missing_enrollments(self, object_id: int | None = None) -> dict[int, str | None]:
@@ -358,12 +426,10 @@ class State:
 
         By their ids, with the names of their objects. Lines of the log are not checked.
         """
-        names = {
-            number: line.object_name
-            for number, line in self.statuses.items()
-            if number is not None and object_id in (None, line.object_id)
-        }
-        present = set(self.transaction.scalars(select(Enrollment.id)))
+        lines = self.statuses.values() if object_id is None else self._statuses_of(object_id)
+        names = {line.enrollment_id: line.object_name for line in lines if line.enrollment_id is not None}
+        ids = select(Enrollment.id)
+        present = set(self.transaction.scalars(ids if object_id is None else ids.where(Enrollment.id.in_(names))))
         if names.keys() <= present:
             return {}
         removals = select(Entry).where(Entry.action.in_((Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)))
@@ -386,10 +452,10 @@ class State:
         self.used()
 
 
-def check_lines(transaction: Transaction, lines: Iterable[Entry]) -> None:
+def check_lines(transaction: Transaction, lines: Iterable[AnyLine | StatusLine]) -> None:
     """Raise `CatalogDamaged` if one of these lines of the log is not as it was written."""
-    if wrong := log.wrong_lines(transaction, lines):
-        raise changed([str(line.object_name) for line in wrong])
+    if wrong := digests.wrong_lines(transaction, {line.id for line in lines}):
+        raise changed(list(map(str, transaction.scalars(select(Entry.object_name).where(Entry.id.in_(wrong[:20]))))))
 
 
 def changed(names: Sequence[str]) -> CatalogDamaged:
@@ -411,7 +477,7 @@ def new_columns(created_utc: datetime, texts: Mapping[str, str]) -> dict[str, An
     return {"label": "", "note": "", "deleted": False, "created_utc": created_utc, **texts}
 
 
-def columns(known: Entry, texts: Mapping[str, str] | None = None, *, deleted: bool = False) -> dict[str, Any]:
+def columns(known: AnyLine, texts: Mapping[str, str] | None = None, *, deleted: bool = False) -> dict[str, Any]:
     """Return the columns of a line of the log that gives a known object this state; other texts stay as they are."""
     own = {"label": known.label or "", "note": known.note or "", "created_utc": known.created_utc}
     return {**own, "object_id": known.object_id, "deleted": deleted, **(texts or {})}
@@ -433,7 +499,7 @@ def ending(one: EnrollmentState) -> dict[str, Any]:
 # Rows
 
 
-def is_possible(enrollment: Enrollment, ended: Entry) -> bool:
+def is_possible(enrollment: Enrollment, ended: StatusLine) -> bool:
     """Return whether an enrollment refers to its own rows only, and has values that this program stores.
 
     A sender can give any values the right digests.

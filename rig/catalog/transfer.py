@@ -23,7 +23,7 @@ from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View,
 from rig.catalog.incoming import Read, ReadImages, RejectedFile, checked, images_of, read_images, store_images
 from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
-from rig.catalog.state import EnrollmentState, State, ending, new_columns
+from rig.catalog.state import AnyLine, EnrollmentState, State, check_lines, ending, new_columns
 from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 
@@ -103,10 +103,10 @@ class CatalogSource:
                 used = [one for one in used if one.object_id in named]
             names: set[str] = set()
             for one in used:
-                known = state.objects[one.object_id]
+                line = state.objects[one.object_id]
                 (found,) = state.enrollments(Enrollment.id == one.enrollment_id)
                 item = TransferItem(
-                    *(one.name, known.label or "", known.note or "", known.created_utc or known.time_utc),
+                    *(one.name, line.label or "", line.note or "", line.created_utc or line.time_utc),
                     *(found.enrollment, found.finished_utc),
                 )
                 _check(item)
@@ -314,7 +314,7 @@ class _Plan:
     wanted: tuple[TransferItem, ...]
     skipped: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
-    named: Mapping[str, Entry] = field(default_factory=dict)
+    named: Mapping[str | None, AnyLine] = field(default_factory=dict)
     known: Mapping[str, EnrollmentState] = field(default_factory=dict)
 
     @property
@@ -337,8 +337,13 @@ class _Plan:
             for part in portions([item.enrollment.key for item in self.wanted], digests.AT_ONCE)
             for one in state.enrollments(Enrollment.key.in_(part))
         }
-        named = {name: line for name in self.names if (line := state.named(name)) is not None}
-        used = {line.object_id for line in state.in_use()}
+        in_use = state.in_use()
+        wanted_names = set(self.names)
+        named: dict[str | None, AnyLine] = {
+            line.object_name: line for line in in_use if line.object_name in wanted_names
+        }
+        check_lines(state.transaction, named.values())
+        used = {line.object_id for line in in_use}
 
         def is_there(item: TransferItem) -> bool:
             """Return whether the target has the enrollment, and an object of this name has it in use."""

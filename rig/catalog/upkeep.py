@@ -14,7 +14,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View
 from rig.catalog.jobs import portions
 from rig.catalog.records import EnrollmentStatus
-from rig.catalog.state import COLLECTED, State
+from rig.catalog.state import COLLECTED, ObjectLine, State
 from rig.core.errors import CatalogBusy
 from rig.core.next_steps import Do
 
@@ -104,7 +104,7 @@ NAMED_IMAGES: Final = union_all(
 """Every image that a row names, with its enrollment, view and size. A result may have none."""
 
 
-def _unused(state: State, *, old: bool) -> dict[int, Entry]:
+def _unused(state: State, *, old: bool) -> dict[int, ObjectLine]:
     """Return the states of the objects of enrollments that can be removed, by the ids of the enrollments."""
     unused = {}
     rows = select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.object_id)

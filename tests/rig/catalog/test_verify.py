@@ -89,11 +89,16 @@ class TestVerify:
         } <= set(found)
 
     @pytest.mark.sqlite
-    def test_view_is_stored_although_a_line_of_another_object_cannot_be_read(self, catalog: Catalog) -> None:
+    def test_work_on_one_object_reads_no_lines_of_others(self, catalog: Catalog) -> None:
         enrollment = catalog.begin("jar", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
-        sql(catalog, "UPDATE log SET time_utc = 'x' WHERE id = 2")
-        enrollment.add(record(0), image(0))  # it reads its own lines only: with many objects, all lines take too long
+        sql(catalog, "UPDATE log SET time_utc = 'x' WHERE object_name = 'tin'")  # these cannot be read
+        enrollment.add(record(0), image(0))  # with many objects, all lines would take too long
         assert enrollment.missing() == (1,)
+        catalog.set_texts("jar", note="of glass")
+        catalog.rename("jar", "jam")
+        assert (catalog.summary("jam").unfinished_views, catalog.object("jam").summary.note) == (1, "of glass")
+        catalog.begin("box", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
+        catalog.delete("jam")
 
     @pytest.mark.sqlite
     def test_removed_and_added_enrollments_are_found(self, catalog: Catalog) -> None:
