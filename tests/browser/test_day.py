@@ -80,6 +80,8 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     # Look at the answer, and correct it.
     page.goto(f"{server.url}runs")
     page.click("#answers button:has-text('Details')")
+    page.click("dialog button:has-text('Compute it again')")
+    page.wait_for_selector("#toasts:has-text('All are as saved.')")
     page.click("dialog button:has-text('Correct it')")
     page.select_option("#right-object", "teapot")
     page.fill("#right-reason", "the label was read")
