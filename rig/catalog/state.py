@@ -336,7 +336,7 @@ class State:
             .execution_options(populate_existing=True)
         )
         rows = self.transaction.scalars(wanted).all()
-        known = self._statuses(Entry.enrollment_id.in_([one.id for one in rows]))
+        known = self._last_statuses(Entry.enrollment_id.in_([one.id for one in rows]))
         endings = [known.get(one.id) for one in rows]
         check_lines(self.transaction, filter(None, endings))
         wrong = self.damaged_enrollments([one.id for one in rows]) if rows else {}
@@ -358,14 +358,14 @@ class State:
         own = [line.enrollment_id for line in self._statuses_of(known.object_id) if line.status is status]
         return next(iter(self.enrollments(Enrollment.id.in_(own))), None) if own else None
 
-    def _statuses(self, *conditions: ColumnElement[bool]) -> dict[int, StatusLine]:
+    def _last_statuses(self, *conditions: ColumnElement[bool]) -> dict[int, StatusLine]:
         wanted = _last_lines(StatusLine, Entry.status, Entry.enrollment_id, *conditions)
         return {row.enrollment_id: StatusLine(*row) for row in self.transaction.execute(wanted)}
 
     def _statuses_of(self, object_id: int | None) -> list[StatusLine]:
         """Return the lines that give the enrollments of an object their present status."""
         ids = select(Entry.enrollment_id).where(Entry.object_id == object_id, Entry.status.is_not(None))
-        found = self._statuses(Entry.enrollment_id.in_(ids)).values()
+        found = self._last_statuses(Entry.enrollment_id.in_(ids)).values()
         return [line for line in found if line.object_id == object_id]
 
     def unfinished(self, known: Entry) -> EnrollmentState:
@@ -413,7 +413,7 @@ class State:
         """
         owners = select(Enrollment.id, Enrollment.object_id).order_by(Enrollment.id)
         rows = dict(self.transaction.execute(owners if ids is None else owners.where(Enrollment.id.in_(ids))).all())
-        known = self.statuses if ids is None else self._statuses(Entry.enrollment_id.in_(rows))
+        known = self.statuses if ids is None else self._last_statuses(Entry.enrollment_id.in_(rows))
         endings = {number: known.get(number) for number in rows}
         seals = {number: None if line is None else line.seal for number, line in endings.items()}
         wrong = set(digests.damaged_enrollments(self.transaction, seals))
