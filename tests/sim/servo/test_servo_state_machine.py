@@ -31,6 +31,8 @@ class ServoMachine(RuleBasedStateMachine):
         self.line = Line()
         self.servo = self.line.add(1, model)
         gain = self.servo.model.initial["Position P Gain"]
+        # e-manual of the MX-28 (2.0): its limits of velocity and acceleration also limit the profile
+        self.largest_profile = {"Profile Velocity": 230, "Profile Acceleration": 32_767} if model == "mx_28" else {}
         self.initial_ram = RAM | {"Position P Gain": gain}
         self.eeprom = dict(EEPROM)
         self.ram = dict(self.initial_ram)
@@ -48,6 +50,8 @@ class ServoMachine(RuleBasedStateMachine):
     def expected_error(self, name: str, value: int) -> StatusError:
         if not 0 <= value <= LARGEST[name]:
             return StatusError.DATA_RANGE
+        if name.startswith("Profile") and value > self.largest_profile.get(name, value):
+            return StatusError.DATA_LIMIT
         return StatusError.ACCESS if name in EEPROM and self.torque else StatusError.NONE
 
     def keep(self, name: str, value: int) -> None:
