@@ -191,6 +191,8 @@ def _usage_error(*, json: bool) -> Iterator[None]:
             path = error.ctx.command_path if error.ctx else "rig"
             problem = UsageError(error.format_message(), next_step=f"For the arguments: {path} --help")
             Settings().print_json(problem.problem)
+        if error.ctx is None and hasattr(error, "option_name"):  # one without its value: Typer shows no usage then
+            error.message += " Next step: rig --help lists the arguments."
         raise
 
 

@@ -116,6 +116,7 @@ OPTIONS = [
 @example("eval", ["--json", "9/" * 2100])
 @example("status", ["--seed", "9" * 4000])
 @example("config show", ["--set", "--json"])
+@example("config show", ["--seed"])
 @example("config show", ["--", "--json"])
 def test_any_arguments_end_with_a_documented_exit_code(commands, command, arguments):
     commands.fresh()

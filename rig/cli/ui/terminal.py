@@ -28,7 +28,7 @@ class _Output:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        if not text:  # Typer tries a stream so, and drops the error of a full disk
+        if text == "":  # Typer tries a stream so, and would drop the error of a full disk
             return 0
         with self._failures():
             return self._stream.write(text)
