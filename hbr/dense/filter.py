@@ -60,7 +60,7 @@ class Belief:
     def ranking(self) -> "DenseRanking":
         """Return the objects considered, best first."""
         scores = self.scores()
-        order = np.argsort(-scores, kind="stable")
+        order = np.argsort(-self.support.max(axis=1), kind="stable")  # the scores of poor objects are all 0
         return DenseRanking(self.index.object_index[order], scores[order])
 
     @cached_property

@@ -62,6 +62,7 @@ def written_out(
     st.lists(st.floats(-720, 720), min_size=1, max_size=3),
 )
 @example(seed=432, omega=0.05, angles=[0.0])  # a gap, beside which the best view is up to 270° away
+@example(seed=656, omega=0.0, angles=[0.0])  # all scores are 0
 def test_support_follows_the_formula_at_every_azimuth_of_every_object(
     seed: int, omega: float, angles: list[float]
 ) -> None:
