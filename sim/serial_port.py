@@ -55,9 +55,10 @@ class VirtualSerial:
             missing = size - len(self._received)
             if missing <= 0 or clock.now_ns() >= deadline_ns:
                 break
-            # An event, such as the answer of a device, may bring further bytes.
-            wake_ns = (deadline_ns, clock.next_event_ns(), self._arrival_ns(missing))
-            clock.advance_to(min(ns for ns in wake_ns if ns is not None))
+            wake_ns = self._arrival_ns(missing)
+            if wake_ns is None:  # an event, such as the answer of a device, may bring bytes
+                wake_ns = clock.next_event_ns()
+            clock.advance_to(deadline_ns if wake_ns is None else min(wake_ns, deadline_ns))
         data = bytes(self._received[:size])
         del self._received[:size]
         return data
