@@ -27,6 +27,7 @@ _RESET_S, _START_S = 0.1, 0.05
 """After DEVICE_RESET (register 107), and the gyro's start-up of 30 ms (PS 6.1) with the PLL's settling."""
 
 _BYTE_NS = 35_000  # a byte at 400 kHz with its acknowledge takes 22.5 µs
+_SLOW_NS = 50_000_000  # this computer was busy: with so uncertain a time, an overflow could not be excluded
 _FRAME = 6  # bytes of a sample in the FIFO: three words
 
 LSB_PER_G = 16384.0
@@ -91,9 +92,12 @@ class Mpu6050(I2cImu):
         lost its settings (a brown-out).
         """
         # How many bytes are there? Two times bound the moment at which the sensor counted them.
-        before_ns = self._clock.now_ns()
-        count = self._fifo_count()
-        after_ns = self._clock.now_ns()
+        for _ in range(2):
+            before_ns = self._clock.now_ns()
+            count = self._fifo_count()
+            after_ns = self._clock.now_ns()
+            if after_ns - before_ns < _SLOW_NS:
+                break
         if count > self.FIFO_BYTES - _FRAME or (
             self._implausible(count, after_ns) and self._implausible(count := self._fifo_count(), after_ns)
         ):

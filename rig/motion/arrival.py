@@ -268,7 +268,8 @@ def causes_found(servo: Servo, config: SafetyConfig) -> Iterator[None]:
 def _find_cause(symptom: RigError, servo: Servo, config: SafetyConfig) -> RigError:
     with suppress(RigError):
         condition = servo.read_condition()
-        if condition.watchdog_tripped:
+        # The end of a motion disarms the watchdog. Then volatile registers show the trip; the torque is still on.
+        if condition.watchdog_tripped or (condition.power_lost and condition.torque):
             return WatchdogTripped(
                 "The servo received nothing from the computer for too long, and its watchdog stopped the table.",
                 next_step=("Check whether the computer slept or was too busy.", *START_AGAIN),

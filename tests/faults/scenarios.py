@@ -137,7 +137,7 @@ SCENARIOS: dict[str, Scenario] = {
             "repair its supply",
             step=ACK,
         ),
-        survived("imu.bursts@move3", "the sensor's FIFO keeps the samples"),
+        survived("imu.bursts:longest=0.3@move3", "the sensor's FIFO keeps the samples"),
         # -- the camera ------------------------------------------------------------------------------------------
         stopped("camera.off@move3", 402, "five consecutive frames fail", "connect the camera"),
         stopped("camera.stuck@move3", 402, "no frame within the timeout", "reconnect the camera"),

@@ -14,6 +14,7 @@ from rig.core.errors import (
     DeviceSilent,
     FaultLatched,
     MotionStopped,
+    MotionTimeout,
     NoProgress,
     RigError,
     Stalled,
@@ -23,6 +24,7 @@ from rig.core.errors import (
     WatchdogTripped,
 )
 from rig.core.next_steps import Do
+from rig.motion.arrival import causes_found
 from rig.motion.turntable import Turntable
 from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import FileStore
@@ -226,6 +228,16 @@ def test_watchdog_of_a_running_program_leaves_no_fault(start, wires):
         assert wires.device.memory["Torque Enable"] == 0
         with Turntable(bench) as table:
             assert table.goto(0.0).encoder_deg == at_rest(wires.device, 0.0)
+
+
+def test_watchdog_that_was_disarmed_after_it_tripped_is_found_as_the_cause(start, wires):
+    with start() as bench, Turntable(bench) as table:
+        table.goto(5.0)
+        bench.servo.arm_watchdog(0.1)
+        bench.clock.sleep(0.3)  # the computer is busy at the end of a motion
+        bench.servo.disarm_watchdog()
+        with pytest.raises(WatchdogTripped), causes_found(bench.servo, bench.config.safety):
+            raise MotionTimeout("The table did not come to rest.", next_step="Look for what shakes the bench.")
 
 
 def test_fault_survives_the_program_until_it_is_acknowledged(start, wires):
