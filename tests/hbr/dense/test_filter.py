@@ -103,6 +103,9 @@ def test_weighted_frames_count_as_much_as_their_weights() -> None:
     twice = update_belief(query, 0.0, once, weight=0.5)
     np.testing.assert_allclose(twice.support, 1.5 * once.support, rtol=1e-5)
     assert (once.amount, twice.amount, twice.queries) == (1.0, 1.5, 2)
+    third = update_belief(query, 0.0, twice)  # without a weight it counts as one
+    assert (third.amount, third.queries) == (2.5, 3)
+    np.testing.assert_allclose(third.support, 2.5 * once.support, rtol=1e-5)
     np.testing.assert_allclose(twice.scores(), once.scores(), rtol=1e-5)
 
 
