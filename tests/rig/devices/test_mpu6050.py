@@ -110,6 +110,17 @@ def test_missing_sensor_raises_device_silent(bench: ImuBench, fault: int, imu: M
     assert (caught.value.evidence["attempts"], caught.value.evidence["errno"]) == (3, fault)
 
 
+def test_pause_of_the_computer_while_the_bytes_are_counted_loses_no_sample(bench: ImuBench, imu: Mpu6050) -> None:
+    bench.clock.sleep(0.1)
+    imu.read_samples()
+    bench.clock.sleep(0.3)
+    pauses_ns = iter([350_000_000])
+    bench.bus.held = lambda time_ns: time_ns + next(pauses_ns, 0)
+    samples = imu.read_samples()
+    assert samples.lost == 0
+    assert samples.time_ns.size == pytest.approx(0.65 * imu.rate_hz, abs=2)
+
+
 def test_fifo_overflow_is_reported_and_cleared(bench: ImuBench, imu: Mpu6050) -> None:
     bench.rotate(30.0)
     bench.clock.sleep(1.5)
