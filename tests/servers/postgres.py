@@ -150,7 +150,8 @@ def use_postgres() -> None:
 
     def of(cls: type[CatalogPlace], place: Any) -> CatalogPlace:
         found: CatalogPlace = original(cls, place)
-        if found.url is not None or found.path.name.startswith((".", "rig-export-")) or found.database_file.exists():
+        is_export = any(part.startswith((".", "rig-export-")) for part in found.path.parts[-2:])
+        if found.url is not None or is_export or found.database_file.exists():
             return found  # an export is a folder
         return place_in(url, found.path)
 
