@@ -20,7 +20,7 @@ from rig.catalog.database import Database
 from rig.catalog.describing import described, hold
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
 from rig.catalog.records import MAX_VIEWS, EnrollmentStatus, Provenance, as_json, checked_texts, clean_name, is_plan
-from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary, State
+from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectLine, ObjectSummary, State
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
@@ -474,7 +474,7 @@ class OpenEnrollment:
         present = set(transaction.scalars(select(View.index).where(View.enrollment_id == self.id)))
         return tuple(index for index in range(len(self.planned_azimuth_deg)) if index not in present)
 
-    def _check_in_progress(self, found: State) -> Entry:
+    def _check_in_progress(self, found: State) -> ObjectLine:
         """Return the state of the object."""
         known = found.by_id(self.enrollment.object_id)
         if known.deleted:

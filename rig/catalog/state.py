@@ -50,10 +50,6 @@ class ObjectLine(NamedTuple):
     deleted: bool
 
 
-AnyLine = ObjectLine | Entry
-"""A line that gives an object its state."""
-
-
 class StatusLine(NamedTuple):
     """What a line of the log says about the status of an enrollment."""
 
@@ -172,7 +168,7 @@ class State:
 
     # Objects
 
-    def find(self, name: str, *, deleted: bool = False) -> Entry:
+    def find(self, name: str, *, deleted: bool = False) -> ObjectLine:
         """Return the state of an object in use, or of the last ``deleted`` one that is still stored.
 
         Raises `ObjectNotFound`: there is no such object. The next step lists similar names.
@@ -193,36 +189,32 @@ class State:
             evidence={"near": near},
         )
 
-    def named(self, name: str) -> Entry | None:
+    def named(self, name: str) -> ObjectLine | None:
         """Return the state of the object in use with this name, which is clean; None if there is none."""
-        ids = select(Entry.object_id).where(Entry.object_name == name, Entry.deleted.is_not(None)).distinct()
-        lines = [self._last(Entry.deleted, Entry.object_id, object_id) for object_id in self.transaction.scalars(ids)]
-        own = [line for line in lines if line and line.object_name == name and not line.deleted]
-        last = max(own, key=lambda line: line.id, default=None)
-        return last and self._checked(last)
+        ids = select(Entry.object_id).where(Entry.object_name == name, Entry.deleted.is_not(None))
+        lines = self._last_states(Entry.object_id.in_(ids))
+        last = max((line for line in lines if line.object_name == name and not line.deleted), default=None)
+        check_lines(self.transaction, [last] if last else [])
+        return last
 
-    def by_id(self, object_id: int | None) -> Entry:
+    def by_id(self, object_id: int | None) -> ObjectLine:
         """Return the state of an object, in use or deleted."""
-        if (found := self._last(Entry.deleted, Entry.object_id, object_id)) is None:
+        found = self._last_states(Entry.object_id == object_id)
+        if not found:
             raise damaged("the owner of an enrollment", object_id)
-        return self._checked(found)
+        check_lines(self.transaction, found)
+        return found[0]
 
     def status_of(self, enrollment_id: int) -> EnrollmentStatus | None:
         """Return the status of an enrollment, unchecked; None if there is none."""
-        found = self._last(Entry.status, Entry.enrollment_id, enrollment_id)
+        found = self._last_statuses(Entry.enrollment_id == enrollment_id).get(enrollment_id)
         return None if found is None else found.status
 
-    def _last(
-        self, sets: InstrumentedAttribute[Any], of: InstrumentedAttribute[Any], number: int | None
-    ) -> Entry | None:
-        wanted = select(Entry).where(of == number, sets.is_not(None)).order_by(Entry.id.desc()).limit(1)
-        return self.transaction.scalar(wanted)
+    def _last_states(self, *conditions: ColumnElement[bool]) -> list[ObjectLine]:
+        wanted = _last_lines(ObjectLine, Entry.deleted, Entry.object_id, *conditions)
+        return [ObjectLine(*row) for row in self.transaction.execute(wanted)]
 
-    def _checked(self, line: Entry) -> Entry:
-        check_lines(self.transaction, [line])
-        return line
-
-    def id_of(self, known: AnyLine | None) -> int:
+    def id_of(self, known: ObjectLine | None) -> int:
         """Return the id of an object; for None that of the one which the next line of the log adds."""
         return known.object_id if known and known.object_id else log.head(self.transaction)[0] + 1
 
@@ -243,7 +235,7 @@ class State:
         self.check()
         return self._summaries(states, self.statuses.values())
 
-    def summary(self, known: Entry) -> ObjectSummary:
+    def summary(self, known: ObjectLine) -> ObjectSummary:
         """Return the summary of one object. The lines about it are checked."""
         statuses = self._statuses_of(known.object_id)
         log.check_complete(self.transaction)
@@ -253,7 +245,7 @@ class State:
 
     def _summaries(
         self,
-        states: Sequence[AnyLine],
+        states: Sequence[ObjectLine],
         statuses: Iterable[StatusLine],
         enrollment_ids: Collection[int] | None = None,
     ) -> list[ObjectSummary]:
@@ -353,7 +345,7 @@ class State:
         logged = [line.enrollment_id for line in self._statuses_of(object_id)]
         return self.enrollments(or_(Enrollment.object_id == object_id, Enrollment.id.in_(logged)))
 
-    def of_status(self, known: AnyLine, status: EnrollmentStatus) -> EnrollmentState | None:
+    def of_status(self, known: ObjectLine, status: EnrollmentStatus) -> EnrollmentState | None:
         """Return the enrollment of an object that is complete or in progress; None if there is none."""
         own = [line.enrollment_id for line in self._statuses_of(known.object_id) if line.status is status]
         return next(iter(self.enrollments(Enrollment.id.in_(own))), None) if own else None
@@ -368,7 +360,7 @@ class State:
         found = self._last_statuses(Entry.enrollment_id.in_(ids)).values()
         return [line for line in found if line.object_id == object_id]
 
-    def unfinished(self, known: Entry) -> EnrollmentState:
+    def unfinished(self, known: ObjectLine) -> EnrollmentState:
         """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
         found = self.of_status(known, EnrollmentStatus.IN_PROGRESS)
         if found is None:
@@ -377,7 +369,7 @@ class State:
             )
         return found
 
-    def check_not_enrolled(self, known: Entry) -> None:
+    def check_not_enrolled(self, known: ObjectLine) -> None:
         """Raise an error if an object is enrolled, or its enrollment has begun."""
         name = str(known.object_name)
         if (begun := self.of_status(known, EnrollmentStatus.IN_PROGRESS)) is not None:
@@ -396,7 +388,7 @@ class State:
                 ),
             )
 
-    def end_current(self, known: AnyLine, status: EnrollmentStatus) -> None:
+    def end_current(self, known: ObjectLine, status: EnrollmentStatus) -> None:
         """End the enrollment of an object that is complete or in progress, if there is one: another replaces it."""
         before = self.of_status(known, status)
         if before is not None:
@@ -452,7 +444,7 @@ class State:
         self.used()
 
 
-def check_lines(transaction: Transaction, lines: Iterable[AnyLine | StatusLine]) -> None:
+def check_lines(transaction: Transaction, lines: Iterable[ObjectLine | StatusLine | Entry]) -> None:
     """Raise `CatalogDamaged` if one of these lines of the log is not as it was written."""
     if wrong := digests.wrong_lines(transaction, {line.id for line in lines}):
         raise changed(list(map(str, transaction.scalars(select(Entry.object_name).where(Entry.id.in_(wrong[:20]))))))
@@ -477,7 +469,7 @@ def new_columns(created_utc: datetime, texts: Mapping[str, str]) -> dict[str, An
     return {"label": "", "note": "", "deleted": False, "created_utc": created_utc, **texts}
 
 
-def columns(known: AnyLine, texts: Mapping[str, str] | None = None, *, deleted: bool = False) -> dict[str, Any]:
+def columns(known: ObjectLine, texts: Mapping[str, str] | None = None, *, deleted: bool = False) -> dict[str, Any]:
     """Return the columns of a line of the log that gives a known object this state; other texts stay as they are."""
     own = {"label": known.label or "", "note": known.note or "", "created_utc": known.created_utc}
     return {**own, "object_id": known.object_id, "deleted": deleted, **(texts or {})}

@@ -19,11 +19,11 @@ from sqlalchemy.orm import Session as Transaction
 from rig.catalog import describing, digests
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
-from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, digest_of, digested, seal_of, sha256_of
+from rig.catalog.facts import Action, Derived, Enrollment, Session, View, digest_of, digested, seal_of, sha256_of
 from rig.catalog.incoming import Read, ReadImages, RejectedFile, checked, images_of, read_images, store_images
 from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
-from rig.catalog.state import AnyLine, EnrollmentState, State, check_lines, ending, new_columns
+from rig.catalog.state import EnrollmentState, ObjectLine, State, check_lines, ending, new_columns
 from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 
@@ -116,7 +116,7 @@ class CatalogSource:
                 yield item
 
 
-def _not_enrolled(state: State, known: Entry) -> CatalogError:
+def _not_enrolled(state: State, known: ObjectLine) -> CatalogError:
     """Return the error for an object without a complete enrollment: it is unfinished, or was abandoned."""
     name = str(known.object_name)
     if state.of_status(known, EnrollmentStatus.IN_PROGRESS) is not None:
@@ -314,7 +314,7 @@ class _Plan:
     wanted: tuple[TransferItem, ...]
     skipped: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
-    named: Mapping[str | None, AnyLine] = field(default_factory=dict)
+    named: Mapping[str | None, ObjectLine] = field(default_factory=dict)
     known: Mapping[str, EnrollmentState] = field(default_factory=dict)
 
     @property
@@ -339,7 +339,7 @@ class _Plan:
         }
         in_use = state.in_use()
         wanted_names = set(self.names)
-        named: dict[str | None, AnyLine] = {
+        named: dict[str | None, ObjectLine] = {
             line.object_name: line for line in in_use if line.object_name in wanted_names
         }
         check_lines(state.transaction, named.values())
